@@ -1,0 +1,273 @@
+"""Choose and open one OpenCL device; its facts; arrays on it; waiting.
+
+`pyopencl` enters the package here and in `program`, nowhere else.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from adof_cl.errors import DeviceError, InputError
+
+# PoCL's sleeping workers wake too late for sub-millisecond kernels unless they are pinned; it reads this
+# when the platform loads. The user's own value stands.
+os.environ.setdefault("POCL_AFFINITY", "1")
+# `program` keeps its own binary cache: pyopencl's stores a second, generic compilation of every kernel.
+os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
+
+import pyopencl as cl  # noqa: E402  (must follow the two settings above)
+
+SELECTOR_VARIABLE = "ADOF_DEVICE"
+
+_TYPE_NAMES = ("gpu", "cpu", "accelerator")
+
+
+@dataclass(frozen=True)
+class DeviceFacts:
+    """What decides how kernels are built and launched; never a vendor's name.
+
+    Attributes
+    ----------
+    index
+        Position in `list_devices()`; a valid selector.
+    kind
+        "gpu", "cpu" or "accelerator".
+    simulated
+        A simulator or an FPGA emulator: correct, slow, and never chosen unless asked for by name or index.
+    vector_bytes
+        Width of the device's native float vector.
+    """
+
+    index: int
+    name: str
+    platform: str
+    kind: str
+    version: str
+    driver_version: str
+    fp64: bool
+    compute_units: int
+    local_memory_bytes: int
+    global_memory_bytes: int
+    max_allocation_bytes: int
+    max_work_group_size: int
+    vector_bytes: int
+    simulated: bool
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the facts as JSON-ready values."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.platform})"
+
+
+def _kind(device: cl.Device, simulated: bool) -> str:
+    flags = int(device.type)
+    # Oclgrind claims to be every type at once.
+    if simulated and flags & int(cl.device_type.CPU):
+        return "cpu"
+    for name, flag in (("gpu", cl.device_type.GPU), ("cpu", cl.device_type.CPU)):
+        if flags & int(flag):
+            return name
+    return "accelerator"
+
+
+def _facts(index: int, platform: cl.Platform, device: cl.Device) -> DeviceFacts:
+    name = " ".join(str(device.name).split())
+    platform_name = str(platform.name)
+    text = f"{name} {platform_name}".lower()
+    simulated = "oclgrind" in text or "simulator" in text or "emulat" in text
+    return DeviceFacts(
+        index=index,
+        name=name,
+        platform=platform_name,
+        kind=_kind(device, simulated),
+        version=str(device.version),
+        driver_version=str(device.driver_version),
+        fp64="cl_khr_fp64" in str(device.extensions).split(),
+        compute_units=int(device.max_compute_units),
+        local_memory_bytes=int(device.local_mem_size),
+        global_memory_bytes=int(device.global_mem_size),
+        max_allocation_bytes=int(device.max_mem_alloc_size),
+        max_work_group_size=int(device.max_work_group_size),
+        vector_bytes=4 * max(1, int(device.native_vector_width_float)),
+        simulated=simulated,
+    )
+
+
+def _found() -> list[tuple[DeviceFacts, cl.Device]]:
+    try:
+        platforms = cl.get_platforms()
+    except cl.Error as failure:  # the loader answers -1001 when it knows no platform at all
+        raise DeviceError(
+            "no OpenCL platform was found: install a runtime, for example `pip install "
+            "pocl-binary-distribution`"
+        ) from failure
+    found: list[tuple[DeviceFacts, cl.Device]] = []
+    for platform in platforms:
+        try:
+            devices = platform.get_devices()
+        except cl.Error:  # a platform whose hardware is absent; the others still count
+            continue
+        found.extend((_facts(len(found) + i, platform, device), device) for i, device in enumerate(devices))
+    if not found:
+        raise DeviceError(
+            "no OpenCL device was found: install a runtime, for example `pip install "
+            "pocl-binary-distribution`"
+        )
+    return found
+
+
+def list_devices() -> list[DeviceFacts]:
+    """List every OpenCL device on this machine, in the order their indices name them.
+
+    Raises
+    ------
+    DeviceError
+        No OpenCL platform or device at all.
+    """
+    return [facts for facts, _ in _found()]
+
+
+def choose(devices: Sequence[DeviceFacts], selector: str | None = None) -> DeviceFacts:
+    """Pick one device: by selector if given, else GPU before CPU and never a simulator.
+
+    Parameters
+    ----------
+    devices
+        As `list_devices` gives them.
+    selector
+        An index ("1"), a type ("cpu", "gpu", "accelerator"), or part of a device's or platform's name, in
+        any case. A type never picks a simulator; a name or an index may.
+
+    Raises
+    ------
+    DeviceError
+        Nothing fits; the message lists what there is.
+    """
+    real = [d for d in devices if not d.simulated]
+    wanted = (selector or "").strip().lower()
+    if not wanted:
+        for kind in _TYPE_NAMES:
+            for device in real:
+                if device.kind == kind:
+                    return device
+        fits: list[DeviceFacts] = []
+    elif wanted.isdecimal():
+        fits = [d for d in devices if d.index == int(wanted)]
+    elif wanted in _TYPE_NAMES:
+        fits = [d for d in real if d.kind == wanted]
+    else:
+        fits = [d for d in devices if wanted in f"{d.name} {d.platform}".lower()]
+        fits.sort(key=lambda d: d.simulated)
+    if fits:
+        return fits[0]
+    listing = "; ".join(f"{d.index}: {d}" for d in devices) or "none"
+    asked = f"no OpenCL device fits '{selector}'" if wanted else "no OpenCL device but simulators was found"
+    raise DeviceError(f"{asked}: choose an index, a type or a part of a name from [{listing}]")
+
+
+class DeviceArray:
+    """A C-ordered array in the device's memory.
+
+    `shape` and `dtype` are NumPy's. Copies to and from the host go through the device's one in-order queue.
+    """
+
+    def __init__(self, device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> None:
+        self.device = device
+        self.shape = shape
+        self.dtype = np.dtype(dtype)
+        self.size = int(np.prod(shape, dtype=np.int64))
+        self.nbytes = self.size * self.dtype.itemsize
+        if self.nbytes > device.facts.max_allocation_bytes:
+            raise DeviceError(
+                f"an array of {self.nbytes} bytes was asked for, {device.facts} allocates at most "
+                f"{device.facts.max_allocation_bytes}: use a smaller frame or another device"
+            )
+        self.buffer = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 1))
+
+    def upload(self, values: NDArray[Any]) -> DeviceArray:
+        """Copy `values` (same shape and dtype) to the device; returns when the host may reuse them."""
+        if values.shape != self.shape or values.dtype != self.dtype:
+            raise InputError(
+                f"an array of shape {values.shape} and type {values.dtype} came, {self.shape} and "
+                f"{self.dtype} was wanted: convert it first"
+            )
+        cl.enqueue_copy(self.device.queue, self.buffer, np.ascontiguousarray(values), is_blocking=True)
+        return self
+
+    def download(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Copy to the host, after everything enqueued before; into `out` if given (same shape, dtype)."""
+        if out is None:
+            out = np.empty(self.shape, self.dtype)
+        elif out.shape != self.shape or out.dtype != self.dtype or not out.flags.c_contiguous:
+            raise InputError(
+                f"out is {out.shape} {out.dtype}, a C-ordered {self.shape} {self.dtype} was wanted: "
+                "allocate it like the device array"
+            )
+        cl.enqueue_copy(self.device.queue, out, self.buffer, is_blocking=True)
+        return out
+
+
+class Device:
+    """One opened OpenCL device: a context and one in-order queue.
+
+    Make it with `Device.open()`. Plans take it, keep it, and enqueue on its queue.
+    """
+
+    def __init__(self, facts: DeviceFacts, handle: cl.Device, *, profiling: bool = False) -> None:
+        self.facts = facts
+        self.handle = handle
+        self.context = cl.Context([handle])
+        properties = cl.command_queue_properties.PROFILING_ENABLE if profiling else None
+        self.queue = cl.CommandQueue(self.context, handle, properties=properties)
+
+    @classmethod
+    def open(cls, selector: str | None = None, *, profiling: bool = False) -> Device:
+        """Open the device `selector` names, else the one `ADOF_DEVICE` names, else the best real one.
+
+        Raises
+        ------
+        DeviceError
+            No device fits, or the driver cannot open it.
+        """
+        found = _found()
+        facts = choose([f for f, _ in found], selector or os.environ.get(SELECTOR_VARIABLE))
+        try:
+            return cls(facts, found[facts.index][1], profiling=profiling)
+        except cl.Error as failure:
+            raise DeviceError(f"{facts} was found but could not be opened: {failure}") from failure
+
+    def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> DeviceArray:
+        """Allocate an uninitialised array."""
+        return DeviceArray(self, shape, dtype)
+
+    def upload(self, values: NDArray[Any]) -> DeviceArray:
+        """Allocate an array like `values` and copy them to it."""
+        return DeviceArray(self, values.shape, values.dtype).upload(values)
+
+    def wait(self) -> None:
+        """Return when everything enqueued so far is done."""
+        self.queue.finish()
+
+    def real_type(self, precision: str) -> np.dtype[Any]:
+        """Return the NumPy type of "float32" or "float64" arithmetic on this device.
+
+        Raises
+        ------
+        InputError
+            Another name.
+        DeviceError
+            "float64" on a device without it.
+        """
+        if precision not in ("float32", "float64"):
+            raise InputError(f"precision is '{precision}': choose 'float32' or 'float64'")
+        if precision == "float64" and not self.facts.fp64:
+            raise DeviceError(f"{self.facts} has no float64 arithmetic: use precision 'float32'")
+        return np.dtype(precision)
