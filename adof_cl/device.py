@@ -21,7 +21,7 @@ os.environ.setdefault("POCL_AFFINITY", "1")
 # `program` keeps its own binary cache: pyopencl's stores a second, generic compilation of every kernel.
 os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
 
-import pyopencl as cl  # noqa: E402  (must follow the two settings above)
+import pyopencl as cl
 
 SELECTOR_VARIABLE = "ADOF_DEVICE"
 
@@ -164,7 +164,8 @@ def choose(devices: Sequence[DeviceFacts], selector: str | None = None) -> Devic
     elif wanted in _TYPE_NAMES:
         fits = [d for d in real if d.kind == wanted]
     else:
-        fits = [d for d in devices if wanted in f"{d.name} {d.platform}".lower()]
+        # PoCL's platform spells its name out; only its version string says "PoCL".
+        fits = [d for d in devices if wanted in f"{d.name} {d.platform} {d.version}".lower()]
         fits.sort(key=lambda d: d.simulated)
     if fits:
         return fits[0]
@@ -225,7 +226,9 @@ class Device:
         self.facts = facts
         self.handle = handle
         self.context = cl.Context([handle])
-        properties = cl.command_queue_properties.PROFILING_ENABLE if profiling else None
+        properties = (
+            cl.command_queue_properties.PROFILING_ENABLE if profiling else cl.command_queue_properties(0)
+        )
         self.queue = cl.CommandQueue(self.context, handle, properties=properties)
 
     @classmethod

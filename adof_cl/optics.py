@@ -88,9 +88,8 @@ class OpticalSystem:
         distance = self.object_distance_um
         if depth_um <= -distance:
             raise InputError(f"depth_um is {depth_um}: it must lie above {-distance}, the lens itself")
-        return (
-            math.pi * self.aperture_um**2 / (4 * self.wavelength_um) * depth_um / (distance * (distance + depth_um))
-        )
+        scale = math.pi * self.aperture_um**2 / (4 * self.wavelength_um)
+        return scale * depth_um / (distance * (distance + depth_um))
 
     def depth_um(self, psi_rad: float) -> float:
         """Return the depth whose defocus is `psi_rad`: the inverse of `psi_rad()`.
@@ -104,7 +103,9 @@ class OpticalSystem:
         distance = self.object_distance_um
         s = 4 * self.wavelength_um * psi_rad * distance / (math.pi * self.aperture_um**2)
         if s >= 1:
-            raise InputError(f"psi_rad is {psi_rad}: no object is so far away; it must lie below {psi_rad / s}")
+            raise InputError(
+                f"psi_rad is {psi_rad}: no object is so far away; it must lie below {psi_rad / s}"
+            )
         return s * distance / (1 - s)
 
     def normalised_frequency(self, cycles_per_um: float) -> float:
@@ -195,7 +196,9 @@ class SlmPanel:
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
-            raise InputError(f"panel {self.name} has {self.rows} x {self.columns} pixels: at least 1 x 1 wanted")
+            raise InputError(
+                f"panel {self.name} has {self.rows} x {self.columns} pixels: at least 1 x 1 was wanted"
+            )
         require_positive(pitch_um=self.pitch_um, frame_rate_hz=self.frame_rate_hz)
         if not 0 < self.fill_factor <= 1:
             raise InputError(f"fill_factor is {self.fill_factor}: above 0 and at most 1 was wanted")

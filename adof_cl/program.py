@@ -15,7 +15,7 @@ import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import numpy as np
 import platformdirs
@@ -71,7 +71,9 @@ def _read(name: str) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except OSError as failure:
-        raise BuildError(f"kernel source {name} is missing from {path.parent}: reinstall adof-cl") from failure
+        raise BuildError(
+            f"kernel source {name} is missing from {path.parent}: reinstall adof-cl"
+        ) from failure
 
 
 def _define(name: str, value: bool | int | float | str) -> str:
@@ -170,8 +172,7 @@ class Program:
         handle = cl.Kernel(self._program, kernel)
         if handle.num_args != len(arguments):
             raise InputError(
-                f"kernel {kernel} takes {handle.num_args} arguments, {len(arguments)} came: "
-                "give one for each"
+                f"kernel {kernel} takes {handle.num_args} arguments, {len(arguments)} came: give one for each"
             )
         return Launch(self.device, handle, global_size, local_size, arguments)
 
@@ -191,13 +192,13 @@ class Program:
             if program is not None:
                 return program
         program = self._built_from_source()
-        binaries = program.get_info(cl.program_info.BINARIES)
+        binaries = cast("list[bytes]", program.get_info(cl.program_info.BINARIES))
         if not binaries or not binaries[0]:
             return program
-        _store(path, bytes(binaries[0]))
+        _store(path, binaries[0])
         # PoCL compiles source builds anew in every process; only a program made from its binary finds
         # its own cache again. So the first run already uses the binary, as every later one will.
-        return self._built_from_binary(bytes(binaries[0])) or program
+        return self._built_from_binary(binaries[0]) or program
 
     def _built_from_binary(self, binary: bytes) -> cl.Program | None:
         try:
@@ -222,7 +223,7 @@ def _build(program: cl.Program, options: list[str]) -> cl.Program:
     with warnings.catch_warnings():
         # pyopencl warns of any compiler output, a driver's "compilation done" included; real errors raise.
         warnings.simplefilter("ignore")
-        return program.build(options=options)
+        return cast("cl.Program", program.build(options=options))
 
 
 def _load(path: Path) -> bytes | None:
@@ -265,5 +266,6 @@ def require_local_memory(device: Device, wanted_bytes: int, what: str) -> None:
     have = device.facts.local_memory_bytes
     if wanted_bytes > have:
         raise DeviceError(
-            f"{what} needs {wanted_bytes} bytes of local memory, {device.facts} has {have}: use a smaller size"
+            f"{what} needs {wanted_bytes} bytes of local memory, {device.facts} has {have}: "
+            "use a smaller size"
         )
