@@ -212,3 +212,26 @@ class SlmPanel:
     def with_stroke(self, stroke_rad: float) -> SlmPanel:
         """Return the same panel at another wavelength or drive, where its full range is `stroke_rad`."""
         return replace(self, stroke_rad=stroke_rad)
+
+
+@dataclass(frozen=True)
+class Mask:
+    """What the modulator adds to the pupil: exp(i(alpha x^3 + focus x^2)) along x, and the same along y.
+
+    Attributes
+    ----------
+    alpha_rad
+        Cubic strength at the stop's edge; 0 is no mask.
+    focus_psi_rad
+        Quadratic term at the stop's edge; -psi(z) brings depth z into focus.
+    """
+
+    alpha_rad: float = 0.0
+    focus_psi_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_finite(alpha_rad=self.alpha_rad, focus_psi_rad=self.focus_psi_rad)
+
+    def psi_rad(self, optics: OpticalSystem, depth_um: float) -> float:
+        """Return the total defocus phase of an object at `depth_um` seen through this mask."""
+        return optics.psi_rad(depth_um) + self.focus_psi_rad
