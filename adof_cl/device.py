@@ -226,10 +226,11 @@ class Device:
         self.facts = facts
         self.handle = handle
         self.context = cl.Context([handle])
-        properties = (
-            cl.command_queue_properties.PROFILING_ENABLE if profiling else cl.command_queue_properties(0)
-        )
-        self.queue = cl.CommandQueue(self.context, handle, properties=properties)
+        if profiling:
+            properties = cl.command_queue_properties.PROFILING_ENABLE
+            self.queue = cl.CommandQueue(self.context, handle, properties=properties)
+        else:
+            self.queue = cl.CommandQueue(self.context, handle)
 
     @classmethod
     def open(cls, selector: str | None = None, *, profiling: bool = False) -> Device:
