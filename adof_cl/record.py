@@ -1,0 +1,152 @@
+"""What a run leaves behind: one entry per iteration, one per named position, and the metrics.
+
+Estimates come from the loop. Truth, where there is a twin to ask, is filled in by whoever composed the run;
+it never reaches the loop.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adof_cl.files import whole_file
+
+Image = NDArray[np.generic]
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One pass of the loop, frame to command.
+
+    Attributes
+    ----------
+    stage
+        "coarse", "fine" or "insert".
+    alpha_rad, focus_psi_rad
+        The mask the frame was taken through.
+    hole_depth_um, hole_depth_sigma_um
+        Estimated depth of the hole below the peg's focus plane, and its standard deviation.
+    error_x_um, error_y_um, error_theta_rad, error_z_um
+        What the servo law saw: estimated pose error left.
+    velocity
+        Command sent: um/s along x, y, z and rad/s about z.
+    hole_bias_px
+        Measured minus true position of the hole's features in camera 1, averaged; NaN without a twin.
+    true_error_x_um, true_error_y_um, true_error_theta_rad, true_depth_um
+        The world's own; NaN without a twin.
+    """
+
+    number: int
+    time_s: float
+    stage: str
+    alpha_rad: float
+    focus_psi_rad: float
+    hole_depth_um: float
+    hole_depth_sigma_um: float
+    error_x_um: float
+    error_y_um: float
+    error_theta_rad: float
+    error_z_um: float
+    velocity: tuple[float, float, float, float]
+    ssd_hole: float
+    ssd_peg: float
+    epipolar_residual_px: float
+    lost_features: int
+    compute_ms: float
+    hole_bias_px: tuple[float, float] = (math.nan, math.nan)
+    true_error_x_um: float = math.nan
+    true_error_y_um: float = math.nan
+    true_error_theta_rad: float = math.nan
+    true_depth_um: float = math.nan
+    true_hole_xyz_um: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+
+
+@dataclass(frozen=True)
+class Position:
+    """The loop's state where the hole passes one of the paper's depths A to E."""
+
+    name: str
+    depth_um: float
+    depth_est_um: float
+    alpha: float
+    focus_psi: float
+    ssd_hole: float
+    ssd_peg: float
+    lateral_bias_um: tuple[float, float]
+    raw: Image | None = None
+    restored_hole: Image | None = None
+    restored_peg: Image | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the JSON-ready part, without images."""
+        images = ("raw", "restored_hole", "restored_peg")
+        return {k: v for k, v in asdict(self).items() if k not in images}
+
+
+@dataclass
+class RunRecord:
+    """Everything one run measured, in the order it happened."""
+
+    seed: int
+    device: str
+    iterations: list[Iteration] = field(default_factory=list)
+    positions: list[Position] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    end_state: str = "not started"
+    docked: bool = False
+    coarse_error: dict[str, float] = field(default_factory=dict)
+    final_error: dict[str, float] = field(default_factory=dict)
+    contacts: int = 0
+    wall_s: float = math.nan
+
+    def metrics(self) -> dict[str, Any]:
+        """Return what `metrics.json` holds."""
+        times = [i.compute_ms for i in self.iterations]
+        quantile = {"p50": 50, "p99": 99}
+        return {
+            "docked": self.docked,
+            "end_state": self.end_state,
+            "final_error_um": {axis: self.final_error.get(axis) for axis in ("x", "y", "z")},
+            "final_error_rad": self.final_error.get("theta"),
+            "coarse_error_um": {axis: self.coarse_error.get(axis) for axis in ("x", "y", "z")},
+            "coarse_error_rad": self.coarse_error.get("theta"),
+            "contacts_before_alignment": self.contacts,
+            "iterations": len(self.iterations),
+            "compute_ms": {k: float(np.percentile(times, q)) if times else None for k, q in quantile.items()},
+            "lost_features": sum(i.lost_features for i in self.iterations),
+            "positions": [p.as_dict() for p in self.positions],
+            "device": self.device,
+            "seed": self.seed,
+            "run_time_s": self.wall_s,
+            "notes": self.notes,
+        }
+
+
+def finite_json(value: Any) -> Any:
+    """Replace what JSON cannot say (NaN, infinity) by null, all the way down."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {str(k): finite_json(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite_json(v) for v in value]
+    if isinstance(value, np.generic):
+        return finite_json(value.item())
+    return value
+
+
+def write_metrics(record: RunRecord, folder: Path) -> Path:
+    """Write `metrics.json` and `iterations.json` into the run folder; returns the former's path."""
+    path = folder / "metrics.json"
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(finite_json(record.metrics()), indent=2) + "\n", encoding="utf-8")
+    rows = [finite_json(asdict(i)) for i in record.iterations]
+    with whole_file(folder / "iterations.json") as temporary:
+        temporary.write_text(json.dumps(rows) + "\n", encoding="utf-8")
+    return path
