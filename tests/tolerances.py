@@ -21,7 +21,7 @@ def eps(precision: str) -> float:
 def fft_relative_l2(precision: str, size: int) -> float:
     """Relative L2 limit of a forward and inverse transform of `size` points in all.
 
-    Rounding errors of a mixed-radix transform add like a random walk over log2(size) stages, twice; each stage
-    costs at most about 1 eps of rms. Higham, Accuracy and Stability, theorem 24.2, gives the log.
+    Rounding errors of a mixed-radix transform add like a random walk over log2(size) stages, twice; each
+    stage costs at most about 1 eps of rms. Higham, Accuracy and Stability, theorem 24.2, gives the log.
     """
     return eps(precision) * (2 + 0.5 * math.log2(max(size, 2)))
