@@ -17,6 +17,13 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("seeded")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what runs on the device, so that another runtime can be asked for just that: -m kernel."""
+    for item in items:
+        if "device" in getattr(item, "fixturenames", ()):
+            item.add_marker("kernel")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _kernel_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep the tests' compiled kernels apart from the user's, unless the environment says where."""

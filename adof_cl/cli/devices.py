@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from typing import Annotated
 
 import typer
-from rich.console import Console
+from rich.console import Console, JustifyMethod
 from rich.table import Table
 
 DeviceOption = Annotated[
@@ -27,8 +29,6 @@ def devices(
 
     Example: adof devices --json
     """
-    import os
-
     from adof_cl.device import SELECTOR_VARIABLE, choose, list_devices
     from adof_cl.errors import DeviceError
 
@@ -44,7 +44,8 @@ def devices(
         return
     table = Table(box=None, header_style="bold")
     for heading in ("", "#", "device", "platform", "type", "fp64", "local memory", "units", "driver"):
-        table.add_column(heading, justify="right" if heading in ("#", "units", "local memory") else "left")
+        justify: JustifyMethod = "right" if heading in ("#", "units", "local memory") else "left"
+        table.add_column(heading, justify=justify, overflow="fold")
     for facts in found:
         table.add_row(
             "*" if facts.index == default else "",
@@ -57,4 +58,5 @@ def devices(
             str(facts.compute_units),
             facts.driver_version,
         )
-    Console().print(table)
+    # A pipe has no width; cutting names short there would hide what the selector matches.
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
