@@ -1,8 +1,8 @@
 """All the mathematics in float64 NumPy: the specification, and what every kernel is tested against.
 
 Read this first. One function per operation, named like its kernel file, its plan, its tests and its case.
-Nothing on the run-time path may import this module; an import contract holds it. Equation numbers are those of
-docs/maths.md.
+Nothing on the run-time path may import this module; an import contract holds it. Equation numbers are those
+of docs/maths.md.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from scipy.special import fresnel
 def otf_1d(u: ArrayLike, alpha_rad: float, psi_rad: float) -> NDArray[np.complex128]:
     """Evaluate the exact optical transfer function of the square stop along one axis.
 
-    H(u) = 1/2 int P(x + u/2) conj P(x - u/2) dx with P = exp(i(alpha x^3 + psi x^2)) on [-1, 1]. Closed form by
-    Fresnel integrals where that is well conditioned, Gauss-Legendre quadrature on the definition elsewhere;
-    either way within 1e-13.
+    H(u) = 1/2 int P(x + u/2) conj P(x - u/2) dx with P = exp(i(alpha x^3 + psi x^2)) on [-1, 1]. Closed form
+    by Fresnel integrals where that is well conditioned, Gauss-Legendre quadrature on the definition
+    elsewhere; either way within 1e-13.
 
     Parameters
     ----------
