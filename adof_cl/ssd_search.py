@@ -1,0 +1,377 @@
+"""Search many templates in one image on the device: sums of squared differences, exact on uint8."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from adof_cl.device import Device, DeviceArray
+from adof_cl.errors import InputError, TrackingError
+from adof_cl.program import Program, require_local_memory
+
+LARGEST_TEMPLATE = 64
+"""Longest side of a template: up to here uint8 sums are exact in every family (docs/maths.md, eq. S3)."""
+
+_IMAGE_KINDS = {np.dtype(np.uint8): 0, np.dtype(np.uint16): 1, np.dtype(np.float32): 2}
+# Sums a work-item of the lanes family holds in registers, as offset rows x vectors: 32 registers with vectors of
+# 16 floats, 16 with shorter ones.
+_LANE_BLOCKS = {16: ((5, 3), (3, 5), (4, 4), (7, 2)), 8: ((5, 2), (3, 3), (9, 1)), 4: ((5, 2), (3, 3), (9, 1))}
+_GROUP_TILE = (16, 32)
+_GROUP_SIZE = (32, 4)
+_BEST_ITEMS = 64
+_SCORE_NONE = 0x7FFFFFFF
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """What one search found, template by template.
+
+    Attributes
+    ----------
+    best_yx : (count, 2) int64
+        Image row and column of the template's top-left pixel at the best match; of equal scores the first in
+        row-major order.
+    score : (count,) float64
+        The smallest score. "ssd": squared grey levels; an exact integer for uint8. "gain_offset": 0 to 1.
+    neighbourhood : (count, 3, 3) float64
+        Scores around the best place; infinite where the search window ends.
+    patches : (count, rows, columns) float32, or None
+        The image under the best match and `patch_margin` pixels around it, its edge pixels repeated beyond it.
+    """
+
+    best_yx: NDArray[np.int64]
+    score: NDArray[np.float64]
+    neighbourhood: NDArray[np.float64]
+    patches: NDArray[np.float32] | None
+
+
+class SsdSearch:
+    """Find `count` templates of one shape, each within its own window of one image on the device.
+
+    Built once: compiles and allocates. Called often: enqueues, allocates nothing, does not wait. Templates and
+    windows may change between calls.
+
+    Parameters
+    ----------
+    device
+        The opened device.
+    image_shape, template_shape, search_shape
+        (rows, columns) of the image, of every template (1 to 64 pixels a side) and of the window each template is
+        searched in. A template takes `search_shape - template_shape + 1` places in its window.
+    count
+        Number of templates.
+    dtype
+        Of image and templates: uint8, uint16 or float32.
+    score
+        "ssd": sum of squared differences. "gain_offset": what remains of the template after the best gain (not
+        negative) and offset of the image, over the template's own variation; 0 is a perfect match, 1 none.
+    patch_margin
+        When given, results carry the image's pixels under each match and so many pixels around it.
+    family
+        "lanes" or "groups"; None chooses lanes on a CPU and groups elsewhere.
+
+    Raises
+    ------
+    InputError
+        A shape, type or name outside the above.
+    DeviceError
+        The device lacks memory.
+
+    Source
+    ------
+    docs/maths.md, eqs. S2 to S7; the paper's section 3.3 (templates matched by SSD).
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        image_shape: tuple[int, int],
+        template_shape: tuple[int, int],
+        search_shape: tuple[int, int],
+        count: int,
+        *,
+        dtype: DTypeLike = np.uint8,
+        score: str = "ssd",
+        patch_margin: int | None = None,
+        family: str | None = None,
+    ) -> None:
+        self.device = device
+        self.image_shape = _shape("image_shape", image_shape)
+        self.template_shape = _shape("template_shape", template_shape)
+        self.search_shape = _shape("search_shape", search_shape)
+        self.count = count
+        self.dtype = np.dtype(dtype)
+        self.score = score
+        self.patch_margin = patch_margin
+        self.family = family or ("lanes" if device.facts.kind == "cpu" else "groups")
+        self._check()
+
+        rows, columns = self.template_shape
+        self.offsets_shape = (self.search_shape[0] - rows + 1, self.search_shape[1] - columns + 1)
+        lanes = 0 if self.family == "groups" else _lanes(device)
+        block_rows, vectors = _lane_block(lanes, rows, self.offsets_shape) if lanes else (1, 1)
+        if lanes:
+            tile = (block_rows, vectors * lanes)
+        else:
+            tile = _GROUP_TILE
+            window = (tile[0] + rows - 1) * (tile[1] + columns - 1) * self.dtype.itemsize
+            require_local_memory(
+                device, window + 8 * tile[0] * tile[1] // 4, f"a search for {rows} x {columns} templates"
+            )
+        tiles_y, tiles_x = (-(-n // t) for n, t in zip(self.offsets_shape, tile, strict=True))
+
+        self._padding = block_rows - 1
+        self._padded = np.zeros((count, rows + 2 * self._padding, columns), np.float32)
+        self._sums = np.zeros((count, 2), np.int32)
+        self._origins = np.zeros((count, 2), np.int32)
+        self._ready = np.zeros(count, np.bool_)
+        patch = 0
+        if patch_margin is not None:
+            self.patch_shape = (rows + 2 * patch_margin, columns + 2 * patch_margin)
+            patch = self.patch_shape[0] * self.patch_shape[1]
+        self._templates_on_device = device.upload(self._padded)
+        self._sums_on_device = device.upload(self._sums)
+        self._origins_on_device = device.upload(self._origins)
+        self._scores = device.empty((count, *self.offsets_shape), np.int32)
+        tile_best = device.empty((count, tiles_y * tiles_x, 2), np.int32)
+        self._records = device.empty((count, 11 + patch), np.int32)
+        self._fetched = np.empty(self._records.shape, np.int32)
+        self._image: DeviceArray | None = None
+
+        program = Program(
+            device,
+            "ssd_search.cl",
+            {
+                "IMAGE_KIND": _IMAGE_KINDS[self.dtype],
+                "GAIN_OFFSET": score == "gain_offset",
+                "TEMPLATE_ROWS": rows,
+                "TEMPLATE_COLUMNS": columns,
+                "LANES": lanes,
+                "BLOCK_ROWS": block_rows,
+                "VECTORS": vectors,
+                "PATCH_MARGIN": -1 if patch_margin is None else patch_margin,
+            },
+        )
+        sizes = [np.int32(n) for n in (*self.image_shape, *self.offsets_shape)]
+        if lanes:
+            grid, group = (tiles_x, tiles_y, count), (1, 1, 1)
+            best_items = 1
+        else:
+            grid = (tiles_x * _GROUP_SIZE[0], tiles_y * _GROUP_SIZE[1], count)
+            group = (*_GROUP_SIZE, 1)
+            best_items = _BEST_ITEMS
+        self._search = program.launch(
+            "ssd_search",
+            grid,
+            group,
+            None,
+            self._templates_on_device,
+            self._sums_on_device,
+            self._origins_on_device,
+            self._scores,
+            tile_best,
+            *sizes,
+        )
+        self._best = program.launch(
+            "ssd_search_best",
+            (count * best_items,),
+            (best_items,),
+            None,
+            self._origins_on_device,
+            self._scores,
+            tile_best,
+            self._records,
+            *sizes,
+            np.int32(tiles_y * tiles_x),
+        )
+
+    def _check(self) -> None:
+        if self.count < 1:
+            raise InputError(f"count is {self.count}: at least 1 template was wanted")
+        if self.dtype not in _IMAGE_KINDS:
+            raise InputError(f"dtype is {self.dtype}: choose uint8, uint16 or float32")
+        if self.score not in ("ssd", "gain_offset"):
+            raise InputError(f"score is '{self.score}': choose 'ssd' or 'gain_offset'")
+        if self.family not in ("lanes", "groups"):
+            raise InputError(f"family is '{self.family}': choose 'lanes' or 'groups'")
+        if self.patch_margin is not None and not 0 <= self.patch_margin <= LARGEST_TEMPLATE:
+            raise InputError(f"patch_margin is {self.patch_margin}: 0 to {LARGEST_TEMPLATE} pixels were wanted")
+        if max(self.template_shape) > LARGEST_TEMPLATE:
+            raise InputError(
+                f"template_shape is {self.template_shape}: at most {LARGEST_TEMPLATE} pixels a side can be searched"
+            )
+        for side in (0, 1):
+            if not self.template_shape[side] <= self.search_shape[side] <= self.image_shape[side]:
+                raise InputError(
+                    f"template {self.template_shape}, window {self.search_shape} and image {self.image_shape} "
+                    "do not nest: a template must fit its window and a window the image"
+                )
+        if self.score == "gain_offset" and self.template_shape == (1, 1):
+            raise InputError("a template of one pixel has no contrast: use score 'ssd' or a larger template")
+
+    def set_templates(self, templates: NDArray[Any]) -> None:
+        """Replace all templates: (count, rows, columns) of the plan's dtype.
+
+        Raises
+        ------
+        InputError
+            Another shape or type, or a value that is not finite.
+        TrackingError
+            A template of one grey level under score "gain_offset".
+        """
+        wanted = (self.count, *self.template_shape)
+        if templates.shape != wanted or templates.dtype != self.dtype:
+            raise InputError(
+                f"templates of shape {templates.shape} and type {templates.dtype} came, {wanted} {self.dtype} was "
+                "wanted: convert them first"
+            )
+        for index, pixels in enumerate(templates):
+            self._prepare(index, pixels)
+        self._templates_on_device.upload(self._padded)
+        self._sums_on_device.upload(self._sums)
+
+    def set_template(self, index: int, pixels: NDArray[Any]) -> None:
+        """Replace one template: (rows, columns) of the plan's dtype; raises as `set_templates`."""
+        if not 0 <= index < self.count:
+            raise InputError(f"template index is {index}: 0 to {self.count - 1} was wanted")
+        if pixels.shape != self.template_shape or pixels.dtype != self.dtype:
+            raise InputError(
+                f"a template of shape {pixels.shape} and type {pixels.dtype} came, {self.template_shape} "
+                f"{self.dtype} was wanted: convert it first"
+            )
+        self._prepare(index, pixels)
+        self._templates_on_device.upload(self._padded)
+        self._sums_on_device.upload(self._sums)
+
+    def _prepare(self, index: int, pixels: NDArray[Any]) -> None:
+        values = pixels.astype(np.float64)
+        if not np.isfinite(values).all():
+            raise InputError(f"template {index} holds a value that is not finite: give it finite pixels")
+        if self.score == "gain_offset" and values.min() == values.max():
+            raise TrackingError(
+                f"template {index} is one grey level, {values.flat[0]:g}: choose one with texture"
+            )
+        if self.dtype == np.uint8:
+            values -= 128
+            self._sums[index] = int(values.sum()), int((values * values).sum())
+        elif self.score == "gain_offset":
+            values -= values.mean()
+            self._sums[index] = np.array([(values * values).sum(), 0], np.float32).view(np.int32)
+        self._padded[index, self._padding : self._padding + self.template_shape[0]] = values
+        self._ready[index] = True
+
+    def set_windows(self, origins_yx: ArrayLike, *, clamp: bool = False) -> NDArray[np.int64]:
+        """Place the windows; return their origins as used.
+
+        Parameters
+        ----------
+        origins_yx : (count, 2)
+            Image row and column of each window's top-left pixel, integers.
+        clamp
+            A window that would leave the image is moved inside by the smallest move; otherwise it is refused.
+
+        Raises
+        ------
+        InputError
+            Another shape, not integers, or a window outside the image.
+        """
+        origins = np.asarray(origins_yx)
+        if origins.shape != (self.count, 2) or not np.issubdtype(origins.dtype, np.integer):
+            raise InputError(
+                f"origins of shape {origins.shape} and type {origins.dtype} came, ({self.count}, 2) integers were "
+                "wanted: one row and column for each template"
+            )
+        last = np.subtract(self.image_shape, self.search_shape)
+        inside = np.clip(origins, 0, last).astype(np.int64)
+        if not clamp and (inside != origins).any():
+            worst = int(np.abs(inside - origins).max(axis=1).argmax())
+            raise InputError(
+                f"window {worst} at {tuple(origins[worst].tolist())} leaves the image: its corner must lie within "
+                f"(0, 0) and {tuple(last.tolist())}"
+            )
+        if not np.array_equal(inside, self._origins):
+            self._origins[:] = inside
+            self._origins_on_device.upload(self._origins)
+        return inside
+
+    def __call__(self, image: DeviceArray) -> None:
+        """Enqueue one search of `image` (`image_shape`, `dtype`); fetch the result afterwards.
+
+        Raises
+        ------
+        InputError
+            Another image shape or type, or a template was never set.
+        """
+        if image is not self._image:
+            if image.shape != self.image_shape or image.dtype != self.dtype:
+                raise InputError(
+                    f"an image of shape {image.shape} and type {image.dtype} came, {self.image_shape} {self.dtype} "
+                    "was wanted: build the search for this image"
+                )
+            self._search.set(0, image)
+            self._best.set(0, image)
+            self._image = image
+        if not self._ready.all():
+            raise InputError(
+                f"template {int(self._ready.argmin())} was never set: call set_templates before the search"
+            )
+        self._search()
+        self._best()
+
+    def fetch(self) -> SearchResult:
+        """Wait for the last search and return what it found, by one small download."""
+        records = self._records.download(self._fetched)
+        neighbourhood = self._decoded(records[:, 2:11]).reshape(self.count, 3, 3)
+        patches = None
+        if self.patch_margin is not None:
+            patches = records[:, 11:].view(np.float32).reshape(self.count, *self.patch_shape).copy()
+        return SearchResult(
+            best_yx=records[:, :2].astype(np.int64),
+            score=neighbourhood[:, 1, 1].copy(),
+            neighbourhood=neighbourhood,
+            patches=patches,
+        )
+
+    def score_maps(self) -> NDArray[np.float64]:
+        """Wait for the last search and return every score, (count, rows, columns) of `offsets_shape`."""
+        return self._decoded(self._scores.download())
+
+    def search(self, image: NDArray[Any]) -> SearchResult:
+        """Upload `image`, search it and return the result: the short way, when speed does not matter."""
+        if image.shape != self.image_shape or image.dtype != self.dtype:
+            raise InputError(
+                f"an image of shape {image.shape} and type {image.dtype} came, {self.image_shape} {self.dtype} was "
+                "wanted: convert it first"
+            )
+        self(self.device.upload(image))
+        return self.fetch()
+
+    def _decoded(self, bits: NDArray[np.int32]) -> NDArray[np.float64]:
+        integers = self.dtype == np.uint8 and self.score == "ssd"
+        values = bits.astype(np.float64) if integers else np.ascontiguousarray(bits).view(np.float32)
+        return np.where(bits == _SCORE_NONE, np.inf, values.astype(np.float64))
+
+
+def _lanes(device: Device) -> int:
+    floats = device.facts.vector_bytes // 4
+    return 16 if floats >= 16 else 8 if floats >= 8 else 4
+
+
+def _lane_block(lanes: int, template_rows: int, offsets: tuple[int, int]) -> tuple[int, int]:
+    """Choose the block that wastes least: sums beyond the offsets, and rows beyond the template."""
+
+    def cost(block: tuple[int, int]) -> float:
+        rows, vectors = block
+        tiles = -(-offsets[0] // rows) * -(-offsets[1] // (vectors * lanes))
+        return float(tiles * (template_rows + rows - 1) * (rows * vectors + vectors + rows / 2))
+
+    return min(_LANE_BLOCKS[lanes], key=cost)
+
+
+def _shape(name: str, shape: tuple[int, int]) -> tuple[int, int]:
+    if len(shape) != 2 or min(shape) < 1:
+        raise InputError(f"{name} is {tuple(shape)}: (rows, columns), each at least 1, was wanted")
+    return int(shape[0]), int(shape[1])
