@@ -1,0 +1,43 @@
+"""Arrays checked at the door: numbers only, the right shape, nothing infinite."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from adof_cl.errors import InputError
+
+
+def finite_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
+    """Return a read-only float64 copy of `value`, or refuse it by name.
+
+    Parameters
+    ----------
+    name
+        What the caller calls it, for the message.
+    shape
+        The shape wanted; None stands for any length of at least 1.
+
+    Raises
+    ------
+    InputError
+        Not numbers, another shape, NaN or infinity.
+    """
+    wanted = "(" + ", ".join("n" if n is None else str(n) for n in shape) + ")"
+    try:
+        raw = np.asarray(value)
+    except ValueError as error:
+        raise InputError(f"{name} is ragged: real numbers of shape {wanted} were wanted") from error
+    if raw.dtype.kind not in "iuf":
+        raise InputError(f"{name} holds {raw.dtype}: real numbers of shape {wanted} were wanted")
+    fits = len(raw.shape) == len(shape) and all(
+        have >= 1 if want is None else have == want for have, want in zip(raw.shape, shape, strict=True)
+    )
+    if not fits:
+        raise InputError(f"{name} is {raw.shape}: real numbers of shape {wanted} were wanted")
+    checked = raw.astype(np.float64)
+    bad = int(np.count_nonzero(~np.isfinite(checked)))
+    if bad:
+        raise InputError(f"{name} holds {bad} numbers that are NaN or infinite: leave those out")
+    checked.flags.writeable = False
+    return checked
