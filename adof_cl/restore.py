@@ -1,0 +1,549 @@
+"""Restore frames on the device: transform, filter, transform back, in three kernels.
+
+One plan holds everything for one frame size: programs, tables, spectra, and as many filters as the caller
+keeps in slots. A call only enqueues. Two kernel families do the same arithmetic (docs/maths.md, section 4):
+*lanes* for CPUs, where a work-item owns one row or column per SIMD lane and nothing waits for anything, and
+*groups* for GPUs, where a work-group shares a pair of rows or a block of columns in local memory.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from adof_cl.device import Device, DeviceArray
+from adof_cl.errors import InputError
+from adof_cl.program import Launch, Program
+
+SMALLEST_SIDE = 8
+LARGEST_SIDE = 4096
+LARGEST_PADDED_SIDE = 16384
+FAMILIES = ("lanes", "groups")
+
+_C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float", "float64": "double"}
+
+# Vector operations per sample of each small transform, counted from restore_butterflies.h; a pass adds its
+# twiddles, loads and stores.
+_OPERATIONS = {2: 2, 3: 5.3, 4: 4, 5: 7.2, 6: 7.3, 7: 9.4, 8: 7, 9: 12.4, 10: 9.2, 12: 9.3, 15: 12.5}
+_PASS_COST = 8.0
+
+
+def good_size(at_least: int) -> int:
+    """Return the smallest length from `at_least` on whose prime factors are 2, 3, 5 and 7."""
+    n = max(1, at_least)
+    while True:
+        rest = n
+        for prime in (2, 3, 5, 7):
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1:
+            return n
+        n += 1
+
+
+@lru_cache(maxsize=256)
+def _radices(n: int) -> tuple[int, ...]:
+    """Split a transform into the passes that cost least, largest first."""
+
+    @lru_cache(maxsize=None)
+    def best(rest: int, largest: int) -> tuple[float, tuple[int, ...]]:
+        if rest == 1:
+            return 0.0, ()
+        found: tuple[float, tuple[int, ...]] = (math.inf, ())
+        for radix, operations in _OPERATIONS.items():
+            if radix <= largest and rest % radix == 0:
+                cost, tail = best(rest // radix, radix)
+                found = min(found, (cost + operations + _PASS_COST, (radix, *tail)))
+        return found
+
+    return best(n, max(_OPERATIONS))[1]
+
+
+@dataclass(frozen=True)
+class _Transform:
+    """How one axis is transformed in place: decimation in frequency, docs/maths.md, eq. W6.
+
+    Attributes
+    ----------
+    length
+        Samples.
+    radices
+        Of the passes, in forward order.
+    """
+
+    length: int
+    radices: tuple[int, ...]
+
+    @classmethod
+    def of(cls, length: int) -> _Transform:
+        return cls(length, _radices(length))
+
+    def passes(self) -> list[tuple[int, int, int]]:
+        """Return (radix, stride, offset of its twiddles in `turns`) of each pass."""
+        listed, rest, offset = [], self.length, 0
+        for radix in self.radices:
+            rest //= radix
+            listed.append((radix, rest, offset))
+            offset += 2 * (radix - 1) * rest
+        return listed
+
+    def turns(self) -> NDArray[np.float64]:
+        """Return cos and -sin of 2 pi j q / (radix * stride): pass by pass, j, then q from 1."""
+        pieces = []
+        for radix, stride, _ in self.passes():
+            j, q = np.arange(stride)[:, None], np.arange(1, radix)[None, :]
+            angle = 2 * np.pi * (j * q % (radix * stride)) / (radix * stride)
+            pieces.append(np.stack([np.cos(angle), -np.sin(angle)], axis=-1).ravel())
+        return np.concatenate(pieces)
+
+    def position(self) -> NDArray[np.int32]:
+        """Return where each frequency lies after the passes."""
+        frequency = np.arange(self.length)
+        place = np.zeros(self.length, dtype=np.int64)
+        for radix, stride, _ in self.passes():
+            place += frequency % radix * stride
+            frequency //= radix
+        return place.astype(np.int32)
+
+    def order(self) -> NDArray[np.int32]:
+        """Return which frequency lies at each place: the inverse of `position`."""
+        order = np.empty(self.length, dtype=np.int32)
+        order[self.position()] = np.arange(self.length, dtype=np.int32)
+        return order
+
+
+def _pass_lists(row: _Transform, column: _Transform) -> str:
+    """Write the passes as macro lists: C can loop over them only if the radix is a literal."""
+
+    def listed(name: str, passes: Sequence[tuple[int, int, int]]) -> str:
+        return f"#define {name}(P) " + " ".join(f"P({r}, {m}, {t})" for r, m, t in passes)
+
+    rows, columns = row.passes(), column.passes()
+    return "\n".join(
+        [
+            listed("ROW_PASSES", rows),
+            listed("ROW_PASSES_BACK", rows[::-1]),
+            listed("COLUMN_PASSES", columns[:-1]),
+            listed("COLUMN_PASSES_BACK", columns[-2::-1]),
+            f"#define COLUMN_LAST(P) P({columns[-1][0]})",
+            "",
+        ]
+    )
+
+
+def padding_weights(samples: int, taper: bool) -> NDArray[np.float64]:
+    """Return the share of the near edge in each sample of the padding (docs/maths.md, eq. W4).
+
+    The padding lies behind the far edge and, the transform being periodic, before the near one: it starts as
+    a copy of the far edge (0) and ends as a copy of the near edge (1), by a raised cosine or by a step.
+    """
+    t = np.arange(samples)
+    if taper:
+        return np.asarray(np.sin(np.pi / 2 * (t + 1) / (samples + 1)) ** 2, dtype=np.float64)
+    return (t >= samples - samples // 2).astype(np.float64)
+
+
+class Restore:
+    """Restore frames of one size: pad, transform, multiply by a filter, transform back, crop.
+
+    Built once: compiles and allocates. Called often: enqueues three kernels, allocates nothing, never waits.
+
+    Parameters
+    ----------
+    device
+        The opened device.
+    shape
+        Frame, (rows, columns), 8 to 4096 each.
+    precision
+        "float32" or "float64": the arithmetic of transforms and filter.
+    in_dtype, out_dtype
+        Frame and image: uint8, uint16, float32, or float64 with that precision. Integers are rounded and
+        clamped on the way out.
+    padding
+        Samples to add at least to each axis, one number or (rows, columns): the support of the blur, which
+        must not reach across the wrap. The padded size is the next product of 2, 3, 5 and 7.
+    taper
+        True: the padding passes smoothly from the far edge to the near one. False: it replicates them, half
+        each, and steps in the middle.
+    family
+        "lanes" or "groups"; by default lanes on a CPU, groups elsewhere.
+
+    Attributes
+    ----------
+    padded_shape
+        (ny, nx): the lengths of the OTF axes; filters are (ny, nx // 2 + 1).
+
+    Raises
+    ------
+    InputError
+        A shape, type, padding or family outside these.
+    DeviceError
+        float64 on a device without it, or too little memory.
+
+    Source
+    ------
+    Paper eq. (3) as corrected in docs/maths.md, eqs W1 to W6.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        shape: tuple[int, int],
+        *,
+        precision: str = "float32",
+        in_dtype: DTypeLike = np.float32,
+        out_dtype: DTypeLike = np.float32,
+        padding: int | tuple[int, int] = 0,
+        taper: bool = True,
+        family: str | None = None,
+    ) -> None:
+        self.device = device
+        self.shape = _checked_shape(shape)
+        self.padded_shape = padded_shape(shape, padding)
+        self._real = device.real_type(precision)
+        self._complex = np.dtype(np.result_type(self._real, np.complex64))
+        self.in_dtype = _checked_dtype("in_dtype", in_dtype, self._real)
+        self.out_dtype = _checked_dtype("out_dtype", out_dtype, self._real)
+        self.family = family or ("lanes" if device.facts.kind == "cpu" else "groups")
+        if self.family not in FAMILIES:
+            raise InputError(f"family is '{family}': choose 'lanes' or 'groups'")
+
+        rows, columns = self.shape
+        ny, nx = self.padded_shape
+        row, column = _Transform.of(nx), _Transform.of(ny)
+        self._lanes = lanes = 64 // self._real.itemsize
+        self._blocks = -(-(nx // 2 + 1) // lanes)
+        row_blocks = -(-rows // (2 * lanes))
+        held = row_blocks * 2 * lanes
+        program = Program(
+            device,
+            "restore_lanes.cl",
+            {
+                "REAL_IS_DOUBLE": self._real == np.float64,
+                "ROWS": rows,
+                "COLS": columns,
+                "NX": nx,
+                "NY": ny,
+                "HELD": held,
+                "BLOCKS": self._blocks,
+                **_io_defines(self.in_dtype, self.out_dtype),
+            },
+            generated=("restore_passes.h", _pass_lists(row, column)),
+        )
+
+        frequency = np.arange(self._blocks * lanes)
+        frequency[frequency > nx // 2] = 0
+        place = row.position()
+        position = np.stack([place[frequency], place[(nx - frequency) % nx]])
+        self._order = device.upload(column.order())
+        self._spectrum = device.empty((self._blocks, held, 2, lanes), self._real)
+        tables = [self._table(t) for t in (row.turns(), column.turns())]
+        blends = [self._table(padding_weights(n - m, taper)) for n, m in ((nx, columns), (ny, rows))]
+        places = device.upload(position)
+        self._filter_shape = (self._blocks, ny, 2, lanes)
+        self._filters: dict[int, DeviceArray] = {}
+
+        self._rows_forward = program.launch(
+            "restore_rows_forward", (row_blocks,), (1,), None, self._spectrum, places, tables[0], blends[0]
+        )
+        self._columns = program.launch(
+            "restore_columns", (self._blocks,), (1,), self._spectrum, self._spectrum, None, tables[1], blends[1]
+        )
+        self._rows_inverse = program.launch(
+            "restore_rows_inverse", (row_blocks,), (1,), self._spectrum, None, places, tables[0]
+        )
+
+        wiener = Program(
+            device, "wiener.cl", {"REAL_IS_DOUBLE": self._real == np.float64, "WIENER_BLOCK": lanes}
+        )
+        size = (self._blocks * lanes, ny)
+        i32, scale = np.int32, self._real.type(0.5 / (nx * ny))
+        zero = self._real.type(0)
+        self._form = wiener.launch(
+            "wiener_axes", size, None, None, None, None, self._order, None,
+            i32(ny), i32(nx), i32(0), i32(0), zero, scale,
+        )  # fmt: skip
+        self._arrange = wiener.launch(
+            "wiener_arrange", size, None, None, self._order, None, i32(ny), i32(nx), scale
+        )
+        self._h_rows = device.empty((ny,), self._complex)
+        self._h_cols = device.empty((nx,), self._complex)
+        self._noise: DeviceArray | None = None
+        self._gain: DeviceArray | None = None
+        self._frame: DeviceArray | None = None
+        self._image: DeviceArray | None = None
+
+    # ---- filters ------------------------------------------------------------------------------------------
+
+    def set_filter_axes(self, h_rows: ArrayLike, h_cols: ArrayLike, nsr: ArrayLike, slot: int = 0) -> None:
+        """Set the Wiener filter of a separable blur, H[j, i] = h_rows[j] h_cols[i].
+
+        Parameters
+        ----------
+        h_rows, h_cols
+            (ny,) and (nx,) complex, of the padded shape, DC first; the Nyquist bins are made real here.
+        nsr
+            Noise to signal power: a number, or (ny, nx // 2 + 1) for each frequency; 0 or more.
+        slot
+            Where to keep the filter.
+
+        Raises
+        ------
+        InputError
+            Wrong length, not finite, negative; the slot keeps what it had.
+        """
+        ny, nx = self.padded_shape
+        rows = _checked_axis("h_rows", h_rows, ny).astype(self._complex)
+        cols = _checked_axis("h_cols", h_cols, nx).astype(self._complex)
+        noise = _checked_nsr(nsr, (ny, nx // 2 + 1))
+        slot = _checked_slot(slot)
+        level: float | DeviceArray
+        if noise.ndim == 0:
+            level = float(noise)
+        else:
+            if self._noise is None:
+                self._noise = self.device.empty(noise.shape, self._real)
+            level = self._noise.upload(noise.astype(self._real))
+        self.set_filter_axes_device(self._h_rows.upload(rows), self._h_cols.upload(cols), level, slot)
+
+    def set_filter_axes_device(
+        self,
+        h_rows: DeviceArray,
+        h_cols: DeviceArray,
+        nsr: float | DeviceArray,
+        slot: int = 0,
+        *,
+        row_entry: int = 0,
+        col_entry: int = 0,
+    ) -> None:
+        """Set a separable filter from 1-D OTFs that are on the device already; enqueues one kernel.
+
+        Parameters
+        ----------
+        h_rows, h_cols
+            (ny,) or (k, ny), and (nx,) or (k, nx), complex of this plan's precision; their values are not
+            checked.
+        nsr
+            A number, or (ny, nx // 2 + 1) real on the device.
+        row_entry, col_entry
+            Which row of a (k, n) table to take.
+        """
+        ny, nx = self.padded_shape
+        slot = _checked_slot(slot)
+        for name, table, length, entry in (
+            ("h_rows", h_rows, ny, row_entry),
+            ("h_cols", h_cols, nx, col_entry),
+        ):
+            if table.dtype != self._complex or table.shape[-1] != length or len(table.shape) > 2:
+                raise InputError(
+                    f"{name} is {table.shape} {table.dtype}, ({length},) or (k, {length}) {self._complex} was "
+                    "wanted: sample the OTF at the padded size"
+                )
+            entries = table.size // length
+            if not 0 <= entry < entries:
+                raise InputError(f"entry {entry} of {name} was asked for: it has {entries}, counted from 0")
+        if isinstance(nsr, DeviceArray):
+            if nsr.shape != (ny, nx // 2 + 1) or nsr.dtype != self._real:
+                raise InputError(
+                    f"nsr is {nsr.shape} {nsr.dtype}, {(ny, nx // 2 + 1)} {self._real} was wanted: give one "
+                    "value for each frequency of the padded half spectrum"
+                )
+            self._form.set(2, nsr)
+        else:
+            self._form.set(2, None)
+            self._form.set(9, self._real.type(float(_checked_nsr(nsr, None))))
+        self._form.set(0, h_rows)
+        self._form.set(1, h_cols)
+        self._form.set(4, self._slot(slot))
+        self._form.set(7, np.int32(row_entry))
+        self._form.set(8, np.int32(col_entry))
+        self._form()
+
+    def set_filter(self, gain: ArrayLike | DeviceArray, slot: int = 0) -> None:
+        """Set any restoration filter: what each frequency of the padded frame is multiplied by.
+
+        Parameters
+        ----------
+        gain
+            (ny, nx // 2 + 1) complex, DC at [0, 0]: what `numpy.fft.rfft2` of the padded frame is multiplied
+            by. On the device already, or on the host.
+
+        Raises
+        ------
+        InputError
+            Wrong shape or type, or not finite; the slot keeps what it had.
+        """
+        ny, nx = self.padded_shape
+        wanted = (ny, nx // 2 + 1)
+        slot = _checked_slot(slot)
+        if isinstance(gain, DeviceArray):
+            if gain.shape != wanted or gain.dtype != self._complex:
+                raise InputError(
+                    f"the filter is {gain.shape} {gain.dtype}, {wanted} {self._complex} was wanted: form it "
+                    "for the padded half spectrum"
+                )
+            source = gain
+        else:
+            values = np.asarray(gain)
+            if values.shape != wanted or values.dtype.kind not in "fciu":
+                raise InputError(
+                    f"the filter is {values.shape} {values.dtype}, {wanted} complex was wanted: form it for "
+                    "the padded half spectrum"
+                )
+            if not np.isfinite(values).all():
+                raise InputError("the filter holds NaN or infinity: only finite gains can be applied")
+            if self._gain is None:
+                self._gain = self.device.empty(wanted, self._complex)
+            source = self._gain.upload(values.astype(self._complex))
+        self._arrange.set(0, source)
+        self._arrange.set(2, self._slot(slot))
+        self._arrange()
+
+    # ---- frames -------------------------------------------------------------------------------------------
+
+    def __call__(self, frame: DeviceArray, out: DeviceArray, slot: int = 0) -> DeviceArray:
+        """Enqueue the restoration of `frame` into `out` with the filter of `slot`; returns `out`.
+
+        Parameters
+        ----------
+        frame, out
+            (rows, columns) of the plan's `in_dtype` and `out_dtype`; `out` may be `frame` if these agree.
+
+        Raises
+        ------
+        InputError
+            Another shape or type, or an empty slot; nothing is enqueued.
+        """
+        for name, array, dtype in (("frame", frame, self.in_dtype), ("out", out, self.out_dtype)):
+            if array.shape != self.shape or array.dtype != dtype:
+                raise InputError(
+                    f"{name} is {array.shape} {array.dtype}, this plan restores {self.shape} {dtype}: make a "
+                    "plan for it"
+                )
+        if slot not in self._filters:
+            raise InputError(f"slot {slot} holds no filter: call set_filter or set_filter_axes first")
+        self._rows_forward.set(0, frame)
+        self._columns.set(2, self._filters[slot])
+        self._rows_inverse.set(1, out)
+        self._rows_forward()
+        self._columns()
+        self._rows_inverse()
+        return out
+
+    def restore(self, frame: NDArray[Any], slot: int = 0) -> NDArray[Any]:
+        """Upload a frame, restore it, wait, and return the image.
+
+        Raises
+        ------
+        InputError
+            Another shape or type than the plan's, NaN or infinity, or an empty slot.
+        """
+        if frame.shape != self.shape or frame.dtype != self.in_dtype:
+            raise InputError(
+                f"the frame is {frame.shape} {frame.dtype}, this plan restores {self.shape} {self.in_dtype}: "
+                "convert it or make a plan for it"
+            )
+        if frame.dtype.kind == "f" and not np.isfinite(frame).all():
+            raise InputError("the frame holds NaN or infinity: replace those pixels first")
+        if self._frame is None or self._image is None:
+            self._frame = self.device.empty(self.shape, self.in_dtype)
+            self._image = self.device.empty(self.shape, self.out_dtype)
+        return self(self._frame.upload(frame), self._image, slot).download()
+
+    # ---- inside -------------------------------------------------------------------------------------------
+
+    def _table(self, values: NDArray[np.float64]) -> DeviceArray:
+        """Upload a table, never empty: a kernel's argument must name some memory."""
+        return self.device.upload(np.append(values, 0.0).astype(self._real))
+
+    def _slot(self, slot: int) -> DeviceArray:
+        if slot not in self._filters:
+            self._filters[slot] = self.device.empty(self._filter_shape, self._real)
+        return self._filters[slot]
+
+
+def padded_shape(shape: tuple[int, int], padding: int | tuple[int, int]) -> tuple[int, int]:
+    """Return the transform's (ny, nx) of a frame of `shape` with at least `padding` samples added.
+
+    Raises
+    ------
+    InputError
+        A negative padding, or one that makes an axis longer than 16384.
+    """
+    rows, columns = _checked_shape(shape)
+    pair = (padding, padding) if isinstance(padding, (int, np.integer)) else tuple(padding)
+    if len(pair) != 2 or any(p != int(p) or p < 0 for p in pair):
+        raise InputError(f"padding is {padding}: one whole number or (rows, columns), 0 or more, was wanted")
+    ny, nx = good_size(rows + int(pair[0])), good_size(columns + int(pair[1]))
+    if max(ny, nx) > LARGEST_PADDED_SIDE:
+        raise InputError(
+            f"padding is {padding}: the padded frame would be {ny} x {nx}, at most {LARGEST_PADDED_SIDE} a "
+            "side was wanted"
+        )
+    return ny, nx
+
+
+def _io_defines(in_dtype: np.dtype[Any], out_dtype: np.dtype[Any]) -> dict[str, int | str]:
+    limit = int(np.iinfo(out_dtype).max) if out_dtype.kind == "u" else 0
+    return {
+        "IN_TYPE": _C_TYPES[in_dtype.name],
+        "IN_BYTES": in_dtype.itemsize,
+        "OUT_TYPE": _C_TYPES[out_dtype.name],
+        "OUT_BYTES": out_dtype.itemsize,
+        "OUT_LIMIT": limit,
+    }
+
+
+def _checked_shape(shape: tuple[int, int]) -> tuple[int, int]:
+    if len(shape) != 2 or not all(SMALLEST_SIDE <= side <= LARGEST_SIDE for side in shape):
+        raise InputError(
+            f"the frame's shape is {tuple(shape)}: (rows, columns) of {SMALLEST_SIDE} to {LARGEST_SIDE} each "
+            "were wanted"
+        )
+    return int(shape[0]), int(shape[1])
+
+
+def _checked_dtype(name: str, dtype: DTypeLike, real: np.dtype[Any]) -> np.dtype[Any]:
+    wanted = ["uint8", "uint16", "float32"] + (["float64"] if real == np.float64 else [])
+    found = np.dtype(dtype)
+    if found.name not in wanted:
+        raise InputError(f"{name} is {found}: choose one of {', '.join(wanted)}")
+    return found
+
+
+def _checked_axis(name: str, values: ArrayLike, length: int) -> NDArray[Any]:
+    axis = np.asarray(values)
+    if axis.shape != (length,) or axis.dtype.kind not in "fciu":
+        raise InputError(
+            f"{name} is {axis.shape} {axis.dtype}, ({length},) complex was wanted: sample the OTF at the "
+            "padded size"
+        )
+    if not np.isfinite(axis).all():
+        raise InputError(f"{name} holds NaN or infinity: a finite OTF was wanted")
+    return axis
+
+
+def _checked_nsr(nsr: ArrayLike, shape: tuple[int, int] | None) -> NDArray[np.float64]:
+    values = np.asarray(nsr)
+    if values.dtype.kind not in "fiu" or (values.shape != () and values.shape != shape):
+        wanted = "a number" if shape is None else f"a number or {shape} numbers"
+        raise InputError(f"nsr is {values.shape} {values.dtype}: {wanted}, 0 or more, was wanted")
+    if not (np.isfinite(values).all() and (values >= 0).all()):
+        worst = float(values.ravel()[np.argmin(np.where(np.isfinite(values), values, -np.inf))])
+        raise InputError(f"nsr is {worst}: a finite noise-to-signal power of 0 or more was wanted")
+    return values.astype(np.float64)
+
+
+def _checked_slot(slot: int) -> int:
+    if slot != int(slot) or slot < 0:
+        raise InputError(f"slot is {slot}: a whole number from 0 on was wanted")
+    return int(slot)
+
+
+__all__ = ["FAMILIES", "Launch", "Restore", "good_size", "padded_shape", "padding_weights"]
