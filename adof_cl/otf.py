@@ -10,13 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adof_cl.device import Device, DeviceArray
-from adof_cl.errors import InputError, LimitError
+from adof_cl.errors import InputError
 from adof_cl.optics import OpticalSystem
+from adof_cl.phase_terms import require_envelope, split, split_turns
 from adof_cl.program import Program
-
-ALPHA_LIMIT_RAD = 1e5
-PSI_LIMIT_RAD = 1e4
-"""Beyond these nothing was measured; a stop with such a phase would need 190 000 samples."""
 
 _GROUP = 64
 
@@ -78,7 +75,7 @@ class Otf1d:
         self._real = device.real_type(precision)
         self.out = device.empty((pairs, n), np.result_type(self._real, np.complex64))
         self._pairs = np.zeros((pairs, 2))
-        frequencies = device.upload(np.stack(split(self.u, self._real), axis=-1))
+        frequencies = device.upload(split(self.u, self._real))
         gains = device.upload(factors.astype(self._real))
         program = Program(device, "otf.cl", {"REAL_IS_DOUBLE": precision == "float64"})
         group = min(_GROUP, device.facts.max_work_group_size)
@@ -159,35 +156,7 @@ class Otf1d:
         return values
 
     def _numbers(self, alpha: float, psi: float) -> list[np.floating[Any]]:
-        turn = 2 * math.pi
         # The stationary point lies outside the stop otherwise, and the kernel never looks.
         shift = psi**2 / (3 * abs(alpha)) if abs(psi) < 3 * abs(alpha) else 0.0
-        numbers: list[np.floating[Any]] = []
-        for value in (abs(alpha) / turn, abs(psi) / turn, shift / turn):
-            hi = self._real.type(value)
-            numbers += [hi, self._real.type(value - float(hi))]
+        numbers = [part for value in (abs(alpha), abs(psi), shift) for part in split_turns(value, self._real)]
         return [*numbers, self._real.type(math.copysign(1.0, alpha))]
-
-
-def require_envelope(alpha_rad: float, psi_rad: float) -> tuple[float, float]:
-    """Return the pair, refusing NaN, infinity and what lies beyond the measured range.
-
-    Raises
-    ------
-    InputError
-        Not finite.
-    LimitError
-        Beyond `ALPHA_LIMIT_RAD` or `PSI_LIMIT_RAD`.
-    """
-    for name, value, limit in (("alpha", alpha_rad, ALPHA_LIMIT_RAD), ("psi", psi_rad, PSI_LIMIT_RAD)):
-        if not math.isfinite(value):
-            raise InputError(f"{name} is {value}: a finite number of radians was wanted")
-        if abs(value) > limit:
-            raise LimitError(f"{name} is {value} rad: at most {limit:g} either way can be computed; use less")
-    return alpha_rad, psi_rad
-
-
-def split(values: NDArray[np.float64], real: np.dtype[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Split float64 values into hi + lo of type `real` (docs/maths.md, eq. P2)."""
-    hi = values.astype(real)
-    return hi, (values - hi).astype(real)

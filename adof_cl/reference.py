@@ -13,7 +13,60 @@ from scipy.special import fresnel
 
 # ---- pupil_phase ------------------------------------------------------------------------------------------
 
+
+def pupil_phase(
+    x: ArrayLike,
+    y: ArrayLike,
+    alpha_rad: float,
+    psi_rad: float,
+    *,
+    tilt_xy_rad: tuple[float, float] = (0.0, 0.0),
+    odd_x_rad: ArrayLike = 0.0,
+    odd_y_rad: ArrayLike = 0.0,
+    map_rad: ArrayLike = 0.0,
+) -> NDArray[np.float64]:
+    """Sum the phase over the stop, not wrapped: (rows, columns), radians.
+
+    Parameters
+    ----------
+    x : (columns,), y : (rows,)
+        Coordinates in half apertures.
+
+    Source
+    ------
+    docs/maths.md, eq. P1.
+    """
+    t_x, t_y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    along_x = ((alpha_rad * t_x + psi_rad) * t_x + tilt_xy_rad[0]) * t_x + np.asarray(odd_x_rad)
+    along_y = ((alpha_rad * t_y + psi_rad) * t_y + tilt_xy_rad[1]) * t_y + np.asarray(odd_y_rad)
+    return np.asarray(along_x[None, :] + along_y[:, None] + np.asarray(map_rad), dtype=np.float64)
+
+
 # ---- slm_encode -------------------------------------------------------------------------------------------
+
+
+def slm_encode(
+    panel_shape: tuple[int, int],
+    stop_px: float,
+    table: NDArray[np.uint8],
+    alpha_rad: float,
+    psi_rad: float,
+    *,
+    tilt_xy_rad: tuple[float, float] = (0.0, 0.0),
+    correction_rad: ArrayLike = 0.0,
+) -> NDArray[np.uint8]:
+    """Return the panel's codes for a mask whose stop is `stop_px` pixels wide, centred; 0 outside.
+
+    Source
+    ------
+    docs/maths.md, eqs. E1 and E2.
+    """
+    y, x = ((np.arange(n) - (n - 1) / 2) * 2 / stop_px for n in panel_shape)
+    phase = pupil_phase(x, y, alpha_rad, psi_rad, tilt_xy_rad=tilt_xy_rad, map_rad=correction_rad)
+    level = np.floor(256 * (phase / (2 * np.pi) % 1) + 0.5).astype(int) % 256
+    inside = (np.abs(y) <= 1)[:, None] & (np.abs(x) <= 1)[None, :]
+    return np.where(inside, table[level], 0).astype(np.uint8)
+
 
 # ---- otf --------------------------------------------------------------------------------------------------
 
