@@ -16,9 +16,13 @@ LARGEST_TEMPLATE = 64
 """Longest side of a template: up to here uint8 sums are exact in every family (docs/maths.md, eq. S3)."""
 
 _IMAGE_KINDS = {np.dtype(np.uint8): 0, np.dtype(np.uint16): 1, np.dtype(np.float32): 2}
-# Sums a work-item of the lanes family holds in registers, as offset rows x vectors: 32 registers with vectors of
-# 16 floats, 16 with shorter ones.
-_LANE_BLOCKS = {16: ((5, 3), (3, 5), (4, 4), (7, 2)), 8: ((5, 2), (3, 3), (9, 1)), 4: ((5, 2), (3, 3), (9, 1))}
+# Sums a work-item of the lanes family holds in registers, as offset rows x vectors: 32 registers with vectors
+# of 16 floats, 16 with shorter ones.
+_LANE_BLOCKS = {
+    16: ((5, 3), (3, 5), (4, 4), (7, 2)),
+    8: ((5, 2), (3, 3), (9, 1)),
+    4: ((5, 2), (3, 3), (9, 1)),
+}
 _GROUP_TILE = (16, 32)
 _GROUP_SIZE = (32, 4)
 _BEST_ITEMS = 64
@@ -39,7 +43,8 @@ class SearchResult:
     neighbourhood : (count, 3, 3) float64
         Scores around the best place; infinite where the search window ends.
     patches : (count, rows, columns) float32, or None
-        The image under the best match and `patch_margin` pixels around it, its edge pixels repeated beyond it.
+        The image under the best match and `patch_margin` pixels around it, its edge pixels repeated beyond
+        it.
     """
 
     best_yx: NDArray[np.int64]
@@ -51,23 +56,24 @@ class SearchResult:
 class SsdSearch:
     """Find `count` templates of one shape, each within its own window of one image on the device.
 
-    Built once: compiles and allocates. Called often: enqueues, allocates nothing, does not wait. Templates and
-    windows may change between calls.
+    Built once: compiles and allocates. Called often: enqueues, allocates nothing, does not wait. Templates
+    and windows may change between calls.
 
     Parameters
     ----------
     device
         The opened device.
     image_shape, template_shape, search_shape
-        (rows, columns) of the image, of every template (1 to 64 pixels a side) and of the window each template is
-        searched in. A template takes `search_shape - template_shape + 1` places in its window.
+        (rows, columns) of the image, of every template (1 to 64 pixels a side) and of the window each
+        template is searched in. A template takes `search_shape - template_shape + 1` places in its window.
     count
         Number of templates.
     dtype
         Of image and templates: uint8, uint16 or float32.
     score
-        "ssd": sum of squared differences. "gain_offset": what remains of the template after the best gain (not
-        negative) and offset of the image, over the template's own variation; 0 is a perfect match, 1 none.
+        "ssd": sum of squared differences. "gain_offset": what remains of the template after the best gain
+        (not negative) and offset of the image, over the template's own variation; 0 is a perfect match, 1
+        none.
     patch_margin
         When given, results carry the image's pixels under each match and so many pixels around it.
     family
@@ -198,16 +204,19 @@ class SsdSearch:
         if self.family not in ("lanes", "groups"):
             raise InputError(f"family is '{self.family}': choose 'lanes' or 'groups'")
         if self.patch_margin is not None and not 0 <= self.patch_margin <= LARGEST_TEMPLATE:
-            raise InputError(f"patch_margin is {self.patch_margin}: 0 to {LARGEST_TEMPLATE} pixels were wanted")
+            raise InputError(
+                f"patch_margin is {self.patch_margin}: 0 to {LARGEST_TEMPLATE} pixels were wanted"
+            )
         if max(self.template_shape) > LARGEST_TEMPLATE:
             raise InputError(
-                f"template_shape is {self.template_shape}: at most {LARGEST_TEMPLATE} pixels a side can be searched"
+                f"template_shape is {self.template_shape}: at most {LARGEST_TEMPLATE} pixels a side can be "
+                "searched"
             )
         for side in (0, 1):
             if not self.template_shape[side] <= self.search_shape[side] <= self.image_shape[side]:
                 raise InputError(
-                    f"template {self.template_shape}, window {self.search_shape} and image {self.image_shape} "
-                    "do not nest: a template must fit its window and a window the image"
+                    f"template {self.template_shape}, window {self.search_shape} and image "
+                    f"{self.image_shape} do not nest: a template must fit its window and a window the image"
                 )
         if self.score == "gain_offset" and self.template_shape == (1, 1):
             raise InputError("a template of one pixel has no contrast: use score 'ssd' or a larger template")
@@ -225,8 +234,8 @@ class SsdSearch:
         wanted = (self.count, *self.template_shape)
         if templates.shape != wanted or templates.dtype != self.dtype:
             raise InputError(
-                f"templates of shape {templates.shape} and type {templates.dtype} came, {wanted} {self.dtype} was "
-                "wanted: convert them first"
+                f"templates of shape {templates.shape} and type {templates.dtype} came, {wanted} "
+                f"{self.dtype} was wanted: convert them first"
             )
         for index, pixels in enumerate(templates):
             self._prepare(index, pixels)
@@ -281,16 +290,16 @@ class SsdSearch:
         origins = np.asarray(origins_yx)
         if origins.shape != (self.count, 2) or not np.issubdtype(origins.dtype, np.integer):
             raise InputError(
-                f"origins of shape {origins.shape} and type {origins.dtype} came, ({self.count}, 2) integers were "
-                "wanted: one row and column for each template"
+                f"origins of shape {origins.shape} and type {origins.dtype} came, ({self.count}, 2) integers "
+                "were wanted: one row and column for each template"
             )
         last = np.subtract(self.image_shape, self.search_shape)
-        inside = np.clip(origins, 0, last).astype(np.int64)
+        inside: NDArray[np.int64] = np.clip(origins, 0, last).astype(np.int64)
         if not clamp and (inside != origins).any():
             worst = int(np.abs(inside - origins).max(axis=1).argmax())
             raise InputError(
-                f"window {worst} at {tuple(origins[worst].tolist())} leaves the image: its corner must lie within "
-                f"(0, 0) and {tuple(last.tolist())}"
+                f"window {worst} at {tuple(origins[worst].tolist())} leaves the image: its corner must lie "
+                f"within (0, 0) and {tuple(last.tolist())}"
             )
         if not np.array_equal(inside, self._origins):
             self._origins[:] = inside
@@ -308,8 +317,8 @@ class SsdSearch:
         if image is not self._image:
             if image.shape != self.image_shape or image.dtype != self.dtype:
                 raise InputError(
-                    f"an image of shape {image.shape} and type {image.dtype} came, {self.image_shape} {self.dtype} "
-                    "was wanted: build the search for this image"
+                    f"an image of shape {image.shape} and type {image.dtype} came, {self.image_shape} "
+                    f"{self.dtype} was wanted: build the search for this image"
                 )
             self._search.set(0, image)
             self._best.set(0, image)
@@ -343,8 +352,8 @@ class SsdSearch:
         """Upload `image`, search it and return the result: the short way, when speed does not matter."""
         if image.shape != self.image_shape or image.dtype != self.dtype:
             raise InputError(
-                f"an image of shape {image.shape} and type {image.dtype} came, {self.image_shape} {self.dtype} was "
-                "wanted: convert it first"
+                f"an image of shape {image.shape} and type {image.dtype} came, {self.image_shape} "
+                f"{self.dtype} was wanted: convert it first"
             )
         self(self.device.upload(image))
         return self.fetch()

@@ -74,8 +74,6 @@ typedef float pixel;
 #endif
 
 #if LANES > 0
-// ---- lanes --------------------------------------------------------------------------------------------------
-
 #if LANES == 16
 typedef float16 vec;
 typedef int16 ivec;
@@ -128,6 +126,13 @@ typedef vec reals;
 #define TO_INTEGERS(v) TO_IVEC(v)
 #define TO_REALS(v) TO_VEC(v)
 #define AS_INTEGERS(v) JOIN(as_int, LANES)(v)
+#else
+typedef int integers;
+typedef float reals;
+#define TO_INTEGERS(v) ((int)(v))
+#define TO_REALS(v) ((float)(v))
+#define AS_INTEGERS(v) as_int(v)
+#endif
 
 #if GAIN_OFFSET && IMAGE_KIND == 0
 // Eq. S6: the sums are first moved, exactly, to about the footprint's own rounded mean, so that what is left to
@@ -147,9 +152,12 @@ static inline __attribute__((always_inline)) integers gain_offset_bits(
                              - TO_REALS(rest) * ((float)template_rest * (1.0f / TAPS));
     const reals residual = 1.0f - (covariance / image_variance) * (covariance / template_variance);
     const reals score = residual > 0.0f ? residual : (reals)0.0f;
-    return AS_INTEGERS((covariance > 0.0f) & (image_variance > 0.0f) ? score : (reals)1.0f);
+    return AS_INTEGERS(((covariance > 0.0f) & (image_variance > 0.0f)) ? score : (reals)1.0f);
 }
 #endif
+
+#if LANES > 0
+// ---- lanes --------------------------------------------------------------------------------------------------
 
 #define TILE_ROWS BLOCK_ROWS
 #define TILE_COLUMNS (VECTORS * LANES)
@@ -444,33 +452,6 @@ void ssd_search(
 typedef int number;           // exact
 #else
 typedef float number;
-#endif
-typedef int integers;
-typedef float reals;
-#define TO_INTEGERS(v) ((int)(v))
-#define TO_REALS(v) ((float)(v))
-#define AS_INTEGERS(v) as_int(v)
-
-#if GAIN_OFFSET && IMAGE_KIND == 0
-// Eq. S6: the sums are first moved, exactly, to about the footprint's own rounded mean, so that what is left to
-// subtract is at most TAPS and float32 loses nothing.
-static inline __attribute__((always_inline)) integers gain_offset_bits(
-    const integers image_1, const integers image_2, const integers cross, const int template_1, const int template_2)
-{
-    const integers mean = TO_INTEGERS(TO_REALS(image_1) * (1.0f / TAPS));
-    const integers rest = image_1 - mean * TAPS;
-    const int template_mean = template_1 / TAPS;
-    const int template_rest = template_1 - template_mean * TAPS;
-    const reals image_variance = TO_REALS(image_2 - mean * (image_1 + rest))
-                                 - TO_REALS(rest) * TO_REALS(rest) * (1.0f / TAPS);
-    const float template_variance = (float)(template_2 - template_mean * (template_1 + template_rest))
-                                    - (float)template_rest * (float)template_rest * (1.0f / TAPS);
-    const reals covariance = TO_REALS(cross - mean * template_rest - image_1 * template_mean)
-                             - TO_REALS(rest) * ((float)template_rest * (1.0f / TAPS));
-    const reals residual = 1.0f - (covariance / image_variance) * (covariance / template_variance);
-    const reals score = residual > 0.0f ? residual : (reals)0.0f;
-    return AS_INTEGERS((covariance > 0.0f) & (image_variance > 0.0f) ? score : (reals)1.0f);
-}
 #endif
 
 __kernel __attribute__((reqd_work_group_size(GROUP_COLUMNS, GROUP_ROWS, 1)))

@@ -1,0 +1,631 @@
+"""Follow features from frame to frame to a fraction of a pixel, each with its covariance.
+
+The device finds every template's best whole-pixel place in one launch; the host refines it on small patches
+in float64 and says when a feature is lost. Equation numbers are those of docs/maths.md, section 5.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+from scipy import ndimage
+
+from adof_cl.device import Device, DeviceArray
+from adof_cl.errors import InputError, TrackingError
+from adof_cl.optics import require_finite, require_positive
+from adof_cl.ssd_search import SsdSearch
+
+Array = NDArray[np.float64]
+
+_CONTEXT = 8  # pixels around a patch: a spline's memory of its end fades as 0.27 a pixel
+_REACH_PX = 1.5  # a refinement that goes farther has left the match it started from
+_POLE = math.sqrt(3) - 2  # of the cubic spline's prefilter
+# White noise of variance 1 has a spline derivative of this variance: 9 (2/sqrt(3) - 1), eq. S11.
+_DERIVATIVE_NOISE = 9 * (2 / math.sqrt(3) - 1)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Where one feature is in one frame.
+
+    Attributes
+    ----------
+    feature_xy_px : (2,)
+        Column and row of the feature; pixel centres at integers. The prediction, when lost.
+    covariance : (2, 2)
+        Of `feature_xy_px`, px^2 (eq. S10); infinite on the diagonal when lost.
+    ssd
+        The paper's score at the best whole-pixel place: squared differences with grey in [0, 1], summed over
+        the template (eq. S12).
+    mismatch
+        What of the image under the template the template does not explain, 0 to 1 (eq. S5).
+    gain
+        The image's contrast over the template's.
+    lost
+        The measurement must not be used.
+    reason
+        Why it is lost; empty otherwise.
+    """
+
+    feature_xy_px: Array
+    covariance: Array
+    ssd: float
+    mismatch: float
+    gain: float
+    lost: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class TrackingLimits:
+    """When a feature counts as lost.
+
+    Attributes
+    ----------
+    mismatch
+        Largest share of the image's variation left unexplained.
+    sigma_px
+        Largest standard deviation along the weakest direction.
+    gain
+        Smallest and largest contrast over the template's.
+    displacement_px
+        Largest distance from the prediction; None leaves it to the search window.
+    """
+
+    mismatch: float = 0.5
+    sigma_px: float = 0.5
+    gain: tuple[float, float] = (0.1, 10.0)
+    displacement_px: float | None = None
+
+    def __post_init__(self) -> None:
+        require_positive(mismatch=self.mismatch, sigma_px=self.sigma_px)
+        require_positive(gain_min=self.gain[0], gain_max=self.gain[1])
+        if self.gain[0] >= self.gain[1]:
+            raise InputError(f"gain limits are {self.gain}: the smaller first was wanted")
+        if self.displacement_px is not None:
+            require_positive(displacement_px=self.displacement_px)
+
+
+@dataclass(frozen=True)
+class Template:
+    """A small picture of a feature, and where in it the feature is. Make it with `Template.cut`.
+
+    Attributes
+    ----------
+    pixels : (rows, columns) uint8, uint16 or float32
+        As cut from the image.
+    anchor_yx : (2,)
+        The feature's place from the top-left pixel's centre, sub-pixel.
+    gradient_yx : (2, rows, columns)
+        Slopes of the interpolating cubic spline, grey levels a pixel.
+    noise
+        Standard deviation of the image noise, grey levels.
+    hessian_yx : (2, 2)
+        sum grad grad^T once gain and offset have taken their share and noise its own (eq. S11).
+    """
+
+    pixels: NDArray[Any]
+    anchor_yx: Array
+    gradient_yx: Array
+    noise: float
+    hessian_yx: Array
+
+    @property
+    def sigma_px(self) -> float:
+        """Predicted standard deviation of a measurement along the template's weak direction (eq. S10)."""
+        return float(self.noise * math.sqrt(2 / np.linalg.eigvalsh(self.hessian_yx)[0]))
+
+    @classmethod
+    def cut(
+        cls,
+        image: NDArray[Any],
+        feature_xy_px: ArrayLike,
+        shape: tuple[int, int] = (20, 20),
+        *,
+        noise: float | None = None,
+        sigma_limit_px: float = 0.1,
+    ) -> Template:
+        """Cut a template around a feature of an image taken in focus.
+
+        Parameters
+        ----------
+        image : (rows, columns) uint8, uint16 or float32
+        feature_xy_px : (2,)
+            Column and row of the feature, as precisely as it is known; it keeps its fraction.
+        shape
+            Rows and columns of the template; the feature lies in its middle to half a pixel.
+        noise
+            Standard deviation of the image noise in grey levels; None estimates it around the feature, where
+            fine texture counts as noise.
+        sigma_limit_px
+            The template is refused when it cannot place a feature better than this along every direction.
+
+        Raises
+        ------
+        InputError
+            Image, shape or place do not fit each other, or are not finite.
+        TrackingError
+            Too little texture, or only along one direction.
+
+        Source
+        ------
+        docs/maths.md, eqs. S10 and S11; the paper's section 3.3 (templates are taken in focus).
+        """
+        feature_yx = np.asarray(feature_xy_px, dtype=np.float64)[::-1]
+        if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16, np.float32):
+            raise InputError(
+                f"an image of {image.ndim} axes and type {image.dtype} came, (rows, columns) of uint8, "
+                "uint16 or float32 was wanted: convert it first"
+            )
+        if feature_yx.shape != (2,) or not np.isfinite(feature_yx).all():
+            raise InputError(
+                f"feature_xy_px is {feature_yx[::-1].tolist()}: a finite column and row were wanted"
+            )
+        if min(shape) < 4:
+            raise InputError(f"a template of {shape} came: at least 4 pixels a side were wanted")
+        require_positive(sigma_limit_px=sigma_limit_px)
+        size = np.array(shape)
+        corner = np.rint(feature_yx - (size - 1) / 2).astype(np.int64)
+        if (corner < 0).any() or (corner + size > image.shape).any():
+            raise InputError(
+                f"a template of {tuple(shape)} around {tuple(feature_yx[::-1].tolist())} leaves the image "
+                f"of {image.shape}: choose a feature farther inside or a smaller template"
+            )
+        low = np.maximum(corner - _CONTEXT, 0)
+        high = np.minimum(corner + size + _CONTEXT, image.shape)
+        around = image[low[0] : high[0], low[1] : high[1]].astype(np.float64)
+        if not np.isfinite(around).all():
+            raise InputError("the image holds values that are not finite around the feature: restore it anew")
+        if noise is None:
+            noise = estimate_noise(around)
+        require_finite(noise=noise)
+        quantum = 1 / math.sqrt(12) if image.dtype != np.float32 else float(np.finfo(np.float32).eps)
+        noise = max(noise, quantum)
+
+        y, x = corner - low
+        rows, columns = slice(y, y + shape[0]), slice(x, x + shape[1])
+        gradient = np.stack([_spline_slope(around, axis)[rows, columns] for axis in (0, 1)])
+        pixels = image[corner[0] : corner[0] + shape[0], corner[1] : corner[1] + shape[1]].copy()
+        template = cls(
+            pixels=pixels,
+            anchor_yx=feature_yx - corner,
+            gradient_yx=gradient,
+            noise=noise,
+            hessian_yx=_texture(gradient, pixels.astype(np.float64), noise),
+        )
+        template._require_texture(sigma_limit_px)
+        return template
+
+    def _require_texture(self, sigma_limit_px: float) -> None:
+        weakest, axes = np.linalg.eigh(self.hessian_yx)
+        count = self.pixels.size
+        # What noise alone feigns scatters by this much; five times it is texture.
+        feigned = 5 * _DERIVATIVE_NOISE * self.noise**2 * math.sqrt(2 * count)
+        wanted = max(2 * self.noise**2 / sigma_limit_px**2, feigned)
+        if weakest[0] >= wanted:
+            return
+        if weakest[1] < wanted:
+            raise TrackingError(
+                f"the template has no texture above the noise of {self.noise:.3g} grey levels: choose a "
+                "feature with contrast"
+            )
+        angle = math.degrees(math.atan2(axes[0, 0], axes[1, 0])) % 180
+        raise TrackingError(
+            f"the template shows an edge only and could slide along {angle:.0f} degrees from the x axis: "
+            "choose a corner or a larger template"
+        )
+
+    def anchored(self, anchor_yx: ArrayLike) -> Template:
+        """Return the same picture with the feature at another place in it."""
+        return replace(self, anchor_yx=np.asarray(anchor_yx, dtype=np.float64))
+
+
+def estimate_noise(image: NDArray[Any]) -> float:
+    """Estimate the standard deviation of white noise, blind to planes and to edges along an axis.
+
+    Source
+    ------
+    Immerkaer, Computer Vision and Image Understanding 64 (1996) 300, with the median in place of the mean.
+    """
+    if image.ndim != 2 or min(image.shape) < 3:
+        raise InputError(f"an image of shape {image.shape} came: at least 3 x 3 pixels were wanted")
+    second = np.diff(image.astype(np.float64), 2, axis=0)
+    mixed = np.diff(second, 2, axis=1)
+    # The mask's weights have squares that sum to 36; 0.6745 is the median of |N(0, 1)|.
+    return float(np.median(np.abs(mixed))) / (6 * 0.6744897501960817)
+
+
+def _spline_slope(values: Array, axis: int) -> Array:
+    coefficients = ndimage.spline_filter1d(values, 3, axis, mode="mirror")
+    padded = np.pad(coefficients, [(1, 1) if a == axis else (0, 0) for a in (0, 1)], mode="reflect")
+    moved = np.moveaxis(padded, axis, 0)
+    return np.moveaxis((moved[2:] - moved[:-2]) / 2, 0, axis)
+
+
+def _texture(gradient_yx: Array, pixels: Array, noise: float) -> Array:
+    slopes = gradient_yx.reshape(2, -1)
+    nuisance, _ = np.linalg.qr(_gain_and_offset(pixels))
+    slopes = slopes - (slopes @ nuisance) @ nuisance.T
+    return np.asarray(slopes @ slopes.T - pixels.size * _DERIVATIVE_NOISE * noise**2 * np.eye(2))
+
+
+def _gain_and_offset(pixels: Array) -> Array:
+    flat = pixels.ravel()
+    return np.stack([flat - flat.mean(), np.ones_like(flat)], axis=1)
+
+
+def quadratic_minimum(neighbourhood: Array) -> Array:
+    """Return where a quadratic surface through 3 x 3 scores is smallest, (..., 2) yx from the centre.
+
+    Least squares over the nine scores (eq. S8), held to one pixel; zero where the scores are not finite or
+    curve downwards.
+
+    Parameters
+    ----------
+    neighbourhood : (..., 3, 3)
+    """
+    s = np.asarray(neighbourhood, dtype=np.float64)
+    finite = np.asarray(np.isfinite(s).all(axis=(-2, -1)))
+    s = np.where(finite[..., None, None], s, 0.0)
+    gy = (s[..., 2, :] - s[..., 0, :]).sum(-1) / 6
+    gx = (s[..., :, 2] - s[..., :, 0]).sum(-1) / 6
+    hyy = (s[..., 2, :] + s[..., 0, :] - 2 * s[..., 1, :]).sum(-1) / 3
+    hxx = (s[..., :, 2] + s[..., :, 0] - 2 * s[..., :, 1]).sum(-1) / 3
+    hxy = (s[..., 2, 2] + s[..., 0, 0] - s[..., 2, 0] - s[..., 0, 2]) / 4
+    determinant = hyy * hxx - hxy * hxy
+    convex = np.asarray(finite & (determinant > 0) & (hyy > 0))
+    divisor = np.where(convex, determinant, 1.0)
+    shift = np.stack([hxy * gx - hxx * gy, hxy * gy - hyy * gx], axis=-1) / divisor[..., None]
+    return np.where(convex[..., None], np.clip(shift, -1, 1), 0.0)
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """How templates lie on their patches, (k,) each.
+
+    Attributes
+    ----------
+    shift_yx : (k, 2)
+        From the patch's whole-pixel place.
+    covariance_yx : (k, 2, 2)
+        Of `shift_yx` (eq. S10).
+    gain, offset
+        image = gain * template + offset.
+    mismatch
+        Share of the image's variation that this leaves unexplained.
+    """
+
+    shift_yx: Array
+    covariance_yx: Array
+    gain: Array
+    offset: Array
+    mismatch: Array
+
+
+class GaussNewton:
+    """Refine the places of k templates of one shape at once, with gain and offset (eq. S9).
+
+    Host, float64, cubic spline; everything that depends on the templates alone is solved beforehand.
+    """
+
+    def __init__(self, templates: Sequence[Template]) -> None:
+        self.shape: tuple[int, int] = templates[0].pixels.shape
+        self._inverses = [_spline_inverse(n + 2 * _CONTEXT) for n in self.shape]
+        count = len(templates)
+        taps = self.shape[0] * self.shape[1]
+        self._model = np.empty((count, taps, 4))
+        self._solve = np.empty((count, 4, taps))
+        self._inverse_hessian = np.empty((count, 2, 2))
+        self._means = np.empty(count)
+        for index, template in enumerate(templates):
+            self.replace(index, template)
+
+    def replace(self, index: int, template: Template) -> None:
+        """Put another template of the same shape in place of number `index`."""
+        values = template.pixels.astype(np.float64)
+        slopes = template.gradient_yx.reshape(2, -1).T
+        model = np.concatenate([slopes, _gain_and_offset(values)], axis=1)
+        normal = model.T @ model
+        self._model[index] = model
+        self._solve[index] = np.linalg.solve(normal, model.T)
+        self._inverse_hessian[index] = np.linalg.inv(template.hessian_yx)
+        self._means[index] = values.mean()
+
+    def __call__(self, patches: NDArray[Any], start_yx: Array, iterations: int = 20) -> Refinement:
+        """Refine from `start_yx` (k, 2); `iterations` 0 only judges the start.
+
+        Parameters
+        ----------
+        patches : (k, rows + 16, columns + 16)
+            The image under each template at its whole-pixel place, and 8 pixels around.
+        """
+        coefficients = self._inverses[0] @ patches.astype(np.float64) @ self._inverses[1].T
+        shift = start_yx.astype(np.float64)
+        image, fit = self._fit(coefficients, shift)
+        for _ in range(iterations):
+            gain = fit[:, 2:3]
+            step = fit[:, :2] / np.where(np.abs(gain) > 1e-3, gain, 1e-3)
+            shift = np.clip(shift - np.clip(step, -1, 1), -_REACH_PX, _REACH_PX)
+            image, fit = self._fit(coefficients, shift)
+            if np.abs(step).max() < 1e-4:
+                break
+
+        gain, offset = fit[:, 2], fit[:, 3] - fit[:, 2] * self._means
+        # What the slopes fit is the last step's rest and its noise; gain and offset alone explain the image.
+        unexplained = image - (self._model @ fit[:, :, None])[:, :, 0]
+        taps = image.shape[1]
+        variance = (unexplained**2).sum(axis=1) / max(taps - 4, 1)
+        kept = np.prod(_interpolated_noise(shift), axis=1)
+        noise2 = variance / (kept + gain**2)
+        scale = noise2 * (1 + gain**2) / np.maximum(gain**2, 1e-12)
+        plain = image - (self._model[:, :, 2:] @ fit[:, 2:, None])[:, :, 0]
+        spread = ((image - image.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
+        mismatch = np.where(spread > 0, (plain**2).sum(axis=1) / np.where(spread > 0, spread, 1), 1.0)
+        return Refinement(
+            shift_yx=shift,
+            covariance_yx=scale[:, None, None] * self._inverse_hessian,
+            gain=gain,
+            offset=offset,
+            mismatch=np.where(gain > 0, np.minimum(mismatch, 1.0), 1.0),
+        )
+
+    def _fit(self, coefficients: Array, shift: Array) -> tuple[Array, Array]:
+        along = [_spline_rows(shift[:, a], n) for a, n in enumerate(self.shape)]
+        image = (along[0] @ coefficients @ along[1].transpose(0, 2, 1)).reshape(len(shift), -1)
+        return image, (self._solve @ image[:, :, None])[:, :, 0]
+
+
+def _spline_inverse(n: int) -> Array:
+    """Return the matrix from samples to cubic B-spline coefficients, mirrored ends."""
+    matrix = np.diag(np.full(n, 4.0)) + np.diag(np.ones(n - 1), 1) + np.diag(np.ones(n - 1), -1)
+    matrix[0, 1] = matrix[-1, -2] = 2
+    return np.asarray(np.linalg.inv(matrix / 6))
+
+
+def _spline_weights(fraction: Array) -> Array:
+    """Return the four cubic B-spline weights at a fraction of a pixel, (..., 4)."""
+    f = fraction
+    g = 1 - f
+    return np.stack([g**3, 4 - 3 * f * f * (2 - f), 4 - 3 * g * g * (2 - g), f**3], axis=-1) / 6
+
+
+def _spline_rows(shift: Array, n: int) -> Array:
+    """Return the (k, n, n + 16) matrices that evaluate a spline at `shift` plus each of n whole pixels."""
+    whole = np.floor(shift)
+    weights = _spline_weights(shift - whole)
+    rows = np.arange(n)
+    rises = (_CONTEXT - 1 + whole).astype(np.int64)
+    matrix = np.zeros((len(shift), n, n + 2 * _CONTEXT))
+    columns = rises[:, None, None] + rows[None, :, None] + np.arange(4)
+    matrix[np.arange(len(shift))[:, None, None], rows[None, :, None], columns] = weights[:, None, :]
+    return matrix
+
+
+def _interpolated_noise(shift: Array) -> Array:
+    """Return how much of white noise's variance spline interpolation keeps at `shift`; 1 at whole pixels."""
+    weights = _spline_weights(shift - np.floor(shift))
+    lag = np.abs(np.subtract.outer(np.arange(4), np.arange(4)))
+    # Autocorrelation of the prefilter's impulse response h_k = sqrt(3) z^|k|.
+    z2 = _POLE * _POLE
+    response = 3 * np.power(_POLE, lag) * ((1 + z2) / (1 - z2) + lag)
+    return np.asarray(np.einsum("...i,ij,...j->...", weights, response, weights))
+
+
+class TemplateTracker:
+    """Follow k features through frames that lie on the device.
+
+    Built once: compiles and allocates. Each frame: `aim` places the windows, `enqueue` searches without
+    waiting, `collect` waits and refines; `track` does all three.
+
+    Parameters
+    ----------
+    device
+        The opened device.
+    image_shape
+        (rows, columns) of every frame.
+    templates
+        One for each feature, of one shape and type; frames have the same type.
+    search_shape
+        (rows, columns) of the window each template is searched in.
+    score
+        "gain_offset" is unmoved by brightness and contrast; "ssd" is the paper's.
+    refine
+        "gauss_newton", "quadratic" or "integer": from the most precise to the fastest.
+    limits
+        When a feature is lost.
+    full_scale
+        The grey level that counts as 1 in `Measurement.ssd`; None: 255, 65535, or 1 for float32.
+
+    Raises
+    ------
+    InputError
+        Templates of several shapes or types, none at all, or sizes that do not nest.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        image_shape: tuple[int, int],
+        templates: Sequence[Template],
+        search_shape: tuple[int, int] = (64, 64),
+        *,
+        score: str = "gain_offset",
+        refine: str = "gauss_newton",
+        limits: TrackingLimits | None = None,
+        full_scale: float | None = None,
+    ) -> None:
+        if not templates:
+            raise InputError("no template came: give at least one")
+        if refine not in ("gauss_newton", "quadratic", "integer"):
+            raise InputError(f"refine is '{refine}': choose 'gauss_newton', 'quadratic' or 'integer'")
+        kinds = {(t.pixels.shape, t.pixels.dtype.name) for t in templates}
+        if len(kinds) > 1:
+            raise InputError(f"templates of several kinds came, {sorted(kinds)}: cut all alike")
+        self.templates = list(templates)
+        self.refine = refine
+        self.limits = limits or TrackingLimits()
+        self.dtype = templates[0].pixels.dtype
+        self.full_scale = full_scale or _full_scale(self.dtype)
+        require_positive(full_scale=self.full_scale)
+        self.search = SsdSearch(
+            device,
+            image_shape,
+            templates[0].pixels.shape,
+            search_shape,
+            len(templates),
+            dtype=self.dtype,
+            score=score,
+            patch_margin=_CONTEXT,
+        )
+        self.search.set_templates(np.stack([t.pixels for t in templates]))
+        self._refiner = GaussNewton(templates)
+        self._anchors = np.stack([t.anchor_yx for t in templates])
+        self._pixels = np.stack([t.pixels for t in templates]).astype(np.float64)
+        self._last = np.zeros((len(templates), 2))
+        self._seen = np.zeros(len(templates), np.bool_)
+        self._placed = False
+        self._step = np.zeros((len(templates), 2))
+        self._aimed = np.zeros((len(templates), 2))
+
+    def replace(self, index: int, template: Template) -> None:
+        """Follow another template of the same shape and type in place of number `index`."""
+        self.search.set_template(index, template.pixels)
+        self.templates[index] = template
+        self._refiner.replace(index, template)
+        self._anchors[index] = template.anchor_yx
+        self._pixels[index] = template.pixels
+
+    def aim(self, feature_xy_px: ArrayLike | None = None, *, displacement_xy_px: ArrayLike = (0, 0)) -> None:
+        """Centre the windows where the features are expected; one that would leave the image moves inside.
+
+        Parameters
+        ----------
+        feature_xy_px : (k, 2)
+            Expected places. None: the last measured ones, carried on by their last displacement.
+        displacement_xy_px : (2,) or (k, 2)
+            Motion known from elsewhere, such as the stage's, added to either.
+
+        Raises
+        ------
+        TrackingError
+            No place was ever given or measured.
+        InputError
+            Another shape, or values that are not finite.
+        """
+        if feature_xy_px is not None:
+            places = np.array(feature_xy_px, dtype=np.float64)
+            if places.shape != self._aimed.shape or not np.isfinite(places).all():
+                raise InputError(
+                    f"feature_xy_px of shape {places.shape} came: {self._aimed.shape} finite pixels were "
+                    "wanted"
+                )
+        elif not self._placed:
+            raise TrackingError(
+                "the tracker has no place to start from: give feature_xy_px at the first frame"
+            )
+        else:
+            places = self._last + self._step
+        moved = np.asarray(displacement_xy_px, dtype=np.float64)
+        if moved.shape not in ((2,), self._aimed.shape) or not np.isfinite(moved).all():
+            raise InputError(
+                f"displacement_xy_px of shape {moved.shape} came: (2,) or {self._aimed.shape} finite "
+                "pixels were wanted"
+            )
+        self._aimed = places + moved
+        self._placed = True
+        slack = np.subtract(self.search.search_shape, self.search.template_shape) / 2
+        edge = float(max(self.search.image_shape)) * 2
+        corner = np.rint(np.clip(self._aimed[:, ::-1], -edge, edge) - self._anchors - slack).astype(np.int64)
+        self.search.set_windows(corner, clamp=True)
+
+    def enqueue(self, image: DeviceArray) -> None:
+        """Search one frame; does not wait."""
+        self.search(image)
+
+    def collect(self) -> list[Measurement]:
+        """Wait for the frame's search and return one measurement for each template."""
+        found = self.search.fetch()
+        assert found.patches is not None
+        start = np.zeros((len(self.templates), 2))
+        if self.refine != "integer":
+            start = quadratic_minimum(found.neighbourhood)
+        patches = np.where(np.isfinite(found.patches), found.patches, 0.0)
+        refined = self._refiner(patches, start, 20 if self.refine == "gauss_newton" else 0)
+        inner = patches[:, _CONTEXT:-_CONTEXT, _CONTEXT:-_CONTEXT]
+        ssd = ((inner - self._pixels) ** 2).sum(axis=(1, 2)) / self.full_scale**2
+        feature_yx = found.best_yx + self._anchors + refined.shift_yx
+
+        measured: list[Measurement] = []
+        for k in range(len(self.templates)):
+            xy = feature_yx[k, ::-1].copy()
+            covariance = refined.covariance_yx[k, ::-1, ::-1].copy()
+            reason = self._why_lost(refined, k, xy, covariance, found.neighbourhood[k])
+            if reason:
+                xy = self._aimed[k].copy()
+                covariance = np.diag([np.inf, np.inf])
+            measured.append(
+                Measurement(
+                    feature_xy_px=xy,
+                    covariance=covariance,
+                    ssd=float(ssd[k]),
+                    mismatch=float(refined.mismatch[k]),
+                    gain=float(refined.gain[k]),
+                    lost=bool(reason),
+                    reason=reason,
+                )
+            )
+        self._remember(measured)
+        return measured
+
+    def _remember(self, measured: Sequence[Measurement]) -> None:
+        """Keep places and last displacements; a lost feature waits where it was last expected."""
+        for k, measurement in enumerate(measured):
+            self._step[k] = (
+                0 if measurement.lost or not self._seen[k] else (measurement.feature_xy_px - self._last[k])
+            )
+            self._last[k] = measurement.feature_xy_px
+            self._seen[k] = not measurement.lost
+
+    def track(
+        self,
+        image: DeviceArray,
+        feature_xy_px: ArrayLike | None = None,
+        *,
+        displacement_xy_px: ArrayLike = (0, 0),
+    ) -> list[Measurement]:
+        """Aim, search one frame and return its measurements."""
+        self.aim(feature_xy_px, displacement_xy_px=displacement_xy_px)
+        self.enqueue(image)
+        return self.collect()
+
+    def _why_lost(
+        self, refined: Refinement, k: int, xy: Array, covariance: Array, neighbourhood: Array
+    ) -> str:
+        limits = self.limits
+        if not np.isfinite(neighbourhood[1, 1]):
+            return "the image is not finite under the window"
+        if not np.isfinite(neighbourhood).all():
+            return "the best match lies at the edge of its search window"
+        if np.abs(refined.shift_yx[k]).max() >= _REACH_PX:
+            return "the sub-pixel fit left the best match"
+        if refined.mismatch[k] > limits.mismatch:
+            return f"the image does not look like the template: mismatch {refined.mismatch[k]:.2f}"
+        if not limits.gain[0] <= refined.gain[k] <= limits.gain[1]:
+            return f"contrast is {refined.gain[k]:.2g} of the template's"
+        sigma = math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
+        if sigma > limits.sigma_px:
+            return f"the place is uncertain by {sigma:.2g} px"
+        distance = float(np.hypot(*(xy - self._aimed[k])))
+        if limits.displacement_px is not None and distance > limits.displacement_px:
+            return f"it moved {distance:.1f} px from where it was expected"
+        return ""
+
+
+def _full_scale(dtype: DTypeLike) -> float:
+    kind = np.dtype(dtype)
+    return 1.0 if kind == np.float32 else float(np.iinfo(kind).max)
