@@ -524,6 +524,9 @@ class TemplateTracker:
                     f"feature_xy_px of shape {places.shape} came: {self._aimed.shape} finite pixels were "
                     "wanted"
                 )
+            self._last, self._placed = places, True
+            self._step[:] = 0
+            self._seen[:] = False
         elif not self._placed:
             raise TrackingError(
                 "the tracker has no place to start from: give feature_xy_px at the first frame"
@@ -537,7 +540,6 @@ class TemplateTracker:
                 "pixels were wanted"
             )
         self._aimed = places + moved
-        self._placed = True
         slack = np.subtract(self.search.search_shape, self.search.template_shape) / 2
         edge = float(max(self.search.image_shape)) * 2
         corner = np.rint(np.clip(self._aimed[:, ::-1], -edge, edge) - self._anchors - slack).astype(np.int64)
