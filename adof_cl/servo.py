@@ -438,7 +438,7 @@ class ServoLaw:
             cosine = float(np.sum(places_um * wanted_um))
             sine = float(np.sum(places_um @ QUARTER_TURN.T * wanted_um))
             raise TrackingError(
-                f"the features are turned {math.degrees(math.atan2(sine, cosine)):.0f} deg from their places: "
+                f"the features are turned {math.degrees(math.atan2(sine, cosine)):.0f} deg off their places: "
                 "at most 90 was wanted, so check that they are not swapped"
             )
         pixels = (desired - features).ravel()

@@ -162,7 +162,7 @@ class AffineCamera:
                 "with points spread over both image axes"
             )
         c = self.covariance
-        spread = np.sqrt(np.abs(np.diag(c))) + np.finfo(np.float64).tiny
+        spread = np.sqrt(np.abs(np.diag(c))) + 1e-30
         # Judged as correlations, since the variances differ by eight orders of magnitude.
         correlation = c / np.outer(spread, spread)
         if not (np.allclose(correlation, correlation.T) and np.linalg.eigvalsh(correlation)[0] >= -1e-9):
