@@ -140,7 +140,48 @@ def _otf_1d_quadrature(w: NDArray[np.float64], alpha: float, psi: float) -> NDAr
     return out
 
 
+def otf_of_profile(phase_rad: ArrayLike) -> NDArray[np.complex128]:
+    """Autocorrelate any phase profile sampled at n cells: H at u = 0, 2/n .. 2, shape (n + 1,).
+
+    Source
+    ------
+    docs/maths.md, eq. O10.
+    """
+    pupil = np.exp(1j * np.asarray(phase_rad, dtype=np.float64))
+    n = pupil.size
+    full = np.correlate(pupil, pupil, mode="full") / n  # lags -(n - 1) .. n - 1
+    return np.asarray(np.append(full[n - 1 :], 0))
+
+
 # ---- psf --------------------------------------------------------------------------------------------------
+
+
+def psf_of_pupil(
+    phase_rad: ArrayLike, amplitude: ArrayLike, *, padded: int
+) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+    """Transform a sampled pupil (n, n) to its point-spread and transfer function, (padded, padded) each.
+
+    The point-spread function sums to 1 and is centred on [0, 0]; so is the transfer function, at u = 2 j/n.
+
+    Source
+    ------
+    docs/maths.md, eq. O11.
+    """
+    pupil = np.asarray(amplitude) * np.exp(1j * np.asarray(phase_rad, dtype=np.float64))
+    intensity = np.abs(np.fft.ifft2(pupil, (padded, padded))) ** 2
+    psf = intensity / intensity.sum()
+    return psf, np.fft.fft2(psf)
+
+
+def psf_of_axes(otf_y: ArrayLike, otf_x: ArrayLike) -> NDArray[np.float64]:
+    """Transform two axes' transfer functions (DC first, Nyquist bins real) to the point-spread function.
+
+    Source
+    ------
+    docs/maths.md, eq. O11 read backwards.
+    """
+    return np.asarray(np.fft.ifft2(np.outer(otf_y, otf_x)).real)
+
 
 # ---- wiener -----------------------------------------------------------------------------------------------
 
@@ -148,4 +189,73 @@ def _otf_1d_quadrature(w: NDArray[np.float64], alpha: float, psi: float) -> NDAr
 
 # ---- image_prep -------------------------------------------------------------------------------------------
 
+
+def image_prep(
+    frame: NDArray[np.integer],
+    dark: ArrayLike,
+    gain: ArrayLike,
+    *,
+    region: tuple[int, int, int, int] | None = None,
+    to_bytes: bool = False,
+) -> NDArray[np.float64]:
+    """Correct a raw frame and crop it.
+
+    Parameters
+    ----------
+    frame : (rows, columns)
+        Raw grey levels.
+    dark, gain
+        One number, or a map of the frame's shape.
+    region
+        top, left, rows, columns.
+    to_bytes
+        Round half up and hold to 0 .. 255.
+
+    Source
+    ------
+    docs/maths.md, eq. S1.
+    """
+    image = np.asarray(gain, dtype=np.float64) * (frame - np.asarray(dark, dtype=np.float64))
+    if region is not None:
+        top, left, rows, columns = region
+        image = image[top : top + rows, left : left + columns]
+    return np.clip(np.floor(image + 0.5), 0, 255) if to_bytes else image
+
+
 # ---- ssd_search -------------------------------------------------------------------------------------------
+
+
+def ssd_search(
+    image: NDArray[np.generic],
+    template: NDArray[np.generic],
+    origin_yx: tuple[int, int],
+    search_shape: tuple[int, int],
+    *,
+    score: str = "ssd",
+) -> tuple[tuple[int, int], NDArray[np.float64] | NDArray[np.int64]]:
+    """Score one template at every place of one window; return the best place in the image, and all scores.
+
+    Integers in, "ssd": int64 sums, exact. "gain_offset" and float images: float64.
+
+    Source
+    ------
+    docs/maths.md, eqs. S2 and S5; of equal scores the first in row-major order (S7).
+    """
+    top, left = origin_yx
+    window = image[top : top + search_shape[0], left : left + search_shape[1]]
+    exact = score == "ssd" and np.issubdtype(image.dtype, np.integer)
+    kind = np.int64 if exact else np.float64
+    places = np.lib.stride_tricks.sliding_window_view(window.astype(kind), template.shape)
+    wanted = template.astype(kind)
+    if score == "ssd":
+        scores = ((places - wanted) ** 2).sum(axis=(2, 3))
+    else:
+        wanted = wanted - wanted.mean()
+        centred = places - places.mean(axis=(2, 3), keepdims=True)
+        squares = (centred**2).sum(axis=(2, 3))
+        cross = (centred * wanted).sum(axis=(2, 3))
+        matches = (cross > 0) & (squares > 0)
+        rho2 = cross**2 / (np.where(matches, squares, 1) * (wanted**2).sum())
+        scores = np.where(matches, np.maximum(1 - rho2, 0), 1.0)
+    y, x = np.unravel_index(int(scores.argmin()), scores.shape)
+    return (top + int(y), left + int(x)), scores
