@@ -64,7 +64,8 @@ def slm_encode(
     y, x = ((np.arange(n) - (n - 1) / 2) * 2 / stop_px for n in panel_shape)
     phase = pupil_phase(x, y, alpha_rad, psi_rad, tilt_xy_rad=tilt_xy_rad, map_rad=correction_rad)
     level = np.floor(256 * (phase / (2 * np.pi) % 1) + 0.5).astype(int) % 256
-    inside = (np.abs(y) <= 1)[:, None] & (np.abs(x) <= 1)[None, :]
+    edge = 1 + 1 / stop_px  # a pixel that straddles the stop's edge still shows the mask
+    inside = (np.abs(y) < edge)[:, None] & (np.abs(x) < edge)[None, :]
     return np.where(inside, table[level], 0).astype(np.uint8)
 
 
@@ -173,7 +174,7 @@ def psf_of_pupil(
     return psf, np.fft.fft2(psf)
 
 
-def psf_of_axes(otf_y: ArrayLike, otf_x: ArrayLike) -> NDArray[np.float64]:
+def psf_of_axes(otf_y: NDArray[np.complex128], otf_x: NDArray[np.complex128]) -> NDArray[np.float64]:
     """Transform two axes' transfer functions (DC first, Nyquist bins real) to the point-spread function.
 
     Source

@@ -165,9 +165,8 @@ class SlmEncode:
         self._axis_launches = []
         for n in (panel.columns, panel.rows):
             t = np.asarray((np.arange(n) - (n - 1) / 2) * (2 / across), dtype=np.float64)
-            held = np.flatnonzero(np.abs(t) <= 1)
-            if not held.size:  # an even panel under a stop narrower than a pixel
-                raise LimitError(f"a stop of {across:.2f} pixels of {panel.name} holds no pixel: widen it")
+            # A pixel that straddles the stop's edge still shows the mask: part of it transmits.
+            held = np.flatnonzero(np.abs(t) * across < across + 1)
             inside += [np.int32(held[0]), np.int32(held[-1])]
             turns.append(device.empty((n,), real))
             self._axis_launches.append(

@@ -14,7 +14,7 @@
 //   table      (256) uchar            level to code
 //   codes      (rows, columns) uchar  result
 //   rows, columns, has_correction
-//   first_row, last_row, first_column, last_column     the pixels whose centres lie in the stop, inclusive
+//   first_row, last_row, first_column, last_column     the pixels the stop uncovers, inclusive
 //
 // Error: none but one level where 256 f + 1/2 is within 1e-4 of a whole number.
 
