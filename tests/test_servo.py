@@ -447,6 +447,10 @@ def test_the_notes_table_of_delays(
     assert gain_from_delay(delay_s, period_s) == pytest.approx(fastest, rel=0.02)
 
 
+def test_a_delay_between_two_samples_counts_as_the_later() -> None:
+    assert [samples_late(delay, 0.1) for delay in (0.0, 0.01, 0.1, 0.11, 0.3)] == [0, 1, 1, 2, 3]
+
+
 @given(delay_s=st.floats(0, 5), period_s=st.floats(0.005, 1))
 def test_the_fastest_gain_is_always_one_the_law_accepts(delay_s: float, period_s: float) -> None:
     require_stable_gain(gain_from_delay(delay_s, period_s), delay_s, period_s)

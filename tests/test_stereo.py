@@ -401,6 +401,13 @@ def test_relative_depth_forgets_the_calibrations_error_as_the_parts_meet() -> No
     assert sigmas[2] < 2e-3  # only the features' own 1e-4 px are left
 
 
+def test_a_displacement_is_as_noisy_as_both_its_ends() -> None:
+    rig, point = exact_rig(30), [0.0, 0, 100]
+    a, b = rig.camera_1.project(point), rig.camera_2.project(point)
+    one, both = triangulate(rig, a, b), triangulate_relative(rig, a, b, a, b)
+    np.testing.assert_allclose(both.covariance_um2, 2 * one.covariance_um2, rtol=1e-9)
+
+
 def test_an_angle_error_scales_depth_and_cancels_between_parts_that_meet() -> None:
     # docs/maths.md, eq. G10: dZ/dtheta = X - Z cot(theta).
     true, believed = exact_rig(30), exact_rig(31)
@@ -549,6 +556,25 @@ def test_what_is_not_our_file_is_refused_in_one_sentence(tmp_path: Path, text: s
     with pytest.raises(CalibrationError, match=says) as refusal:
         load_rig(path)
     assert "\n" not in str(refusal.value)
+
+
+RIG = calibrated_rig(FIVE_PLANES)
+
+
+@given(at=st.integers(0, 10**6), byte=st.integers(0, 255))
+def test_a_file_with_one_byte_changed_is_refused_or_means_the_same(
+    tmp_path_factory: pytest.TempPathFactory, at: int, byte: int
+) -> None:
+    path = tmp_path_factory.mktemp("flip") / "rig.json"
+    save_calibration(path, RIG)
+    data = bytearray(path.read_bytes())
+    data[at % len(data)] = byte
+    path.write_bytes(data)
+    try:
+        again = load_rig(path)
+    except CalibrationError:
+        return
+    np.testing.assert_array_equal(again.matrix_px_per_um, RIG.matrix_px_per_um)
 
 
 def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
