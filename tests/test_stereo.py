@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -570,11 +571,9 @@ def test_a_file_with_one_byte_changed_is_refused_or_means_the_same(
     data = bytearray(path.read_bytes())
     data[at % len(data)] = byte
     path.write_bytes(data)
-    try:
+    with suppress(CalibrationError):
         again = load_rig(path)
-    except CalibrationError:
-        return
-    np.testing.assert_array_equal(again.matrix_px_per_um, RIG.matrix_px_per_um)
+        np.testing.assert_array_equal(again.matrix_px_per_um, RIG.matrix_px_per_um)
 
 
 def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
