@@ -260,9 +260,11 @@ class Restore:
         )
 
         wiener = Program(
-            device, "wiener.cl", {"REAL_IS_DOUBLE": self._real == np.float64, "WIENER_BLOCK": lanes}
+            device,
+            "wiener.cl",
+            {"REAL_IS_DOUBLE": self._real == np.float64, "WIENER_BLOCK": lanes, "WIENER_RUN": lanes},
         )
-        size = (self._blocks * lanes, ny)
+        size = (self._blocks, 4)
         i32, scale = np.int32, self._real.type(0.5 / (nx * ny))
         zero = self._real.type(0)
         self._form = wiener.launch(
