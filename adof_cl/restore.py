@@ -149,6 +149,76 @@ def padding_weights(samples: int, taper: bool) -> NDArray[np.float64]:
     return (t >= samples - samples // 2).astype(np.float64)
 
 
+@dataclass(frozen=True)
+class _Cut:
+    """How a family divides the work.
+
+    Attributes
+    ----------
+    block, blocks
+        Columns per block of the spectrum, and blocks.
+    held
+        Rows of the spectrum.
+    row_groups, row_items, column_items
+        Work-groups for the rows, and work-items in each group; columns have one group per block.
+    run
+        Columns a work-item of the filter kernels forms.
+    row_scratch, column_scratch
+        Extra buffers a family's kernels take, in reals; 0: none is needed.
+    """
+
+    block: int
+    blocks: int
+    held: int
+    row_groups: int
+    row_items: int
+    column_items: int
+    run: int
+    defines: dict[str, int]
+    row_scratch: tuple[int, ...] = ()
+    column_scratch: tuple[int, ...] = ()
+
+
+def _lanes(rows: int, nx: int, real_bytes: int) -> _Cut:
+    """Divide for SIMD lanes: 64 bytes of columns, or of pairs of rows, to a work-item."""
+    lanes = 64 // real_bytes
+    row_groups = -(-rows // (2 * lanes))
+    blocks = -(-(nx // 2 + 1) // lanes)
+    return _Cut(lanes, blocks, row_groups * 2 * lanes, row_groups, 1, 1, lanes, {})
+
+
+def _groups(
+    rows: int, padded: tuple[int, int], real_bytes: int, local_bytes: int, most_items: int
+) -> _Cut:
+    """Divide for work-groups, within local memory and the largest group.
+
+    Columns: the widest block of up to 64 bytes that fits local memory, down to one column. An axis of which
+    not even one row or column fits works in a scratch buffer in global memory instead.
+    """
+    ny, nx = padded
+    block = widest = 64 // real_bytes
+    while block > 1 and 2 * ny * block * real_bytes > local_bytes:
+        block //= 2
+    column_local = 2 * ny * block * real_bytes <= local_bytes
+    row_local = 2 * nx * real_bytes <= local_bytes
+    if not column_local:
+        block = widest
+    items = 1
+    while 2 * items <= min(256, most_items, max(nx, ny) // 4):
+        items *= 2
+    block = min(block, items)
+    row_groups, blocks = -(-rows // 2), -(-(nx // 2 + 1) // block)
+    return _Cut(
+        block, blocks, 2 * row_groups, row_groups, items, items, 1,
+        {
+            "BLOCK": block, "ROW_ITEMS": items, "COLUMN_ITEMS": items,
+            "ROW_LOCAL": int(row_local), "COLUMN_LOCAL": int(column_local),
+        },
+        row_scratch=(0 if row_local else row_groups * 2 * nx,),
+        column_scratch=(0 if column_local else blocks * 2 * ny * block,),
+    )  # fmt: skip
+
+
 class Restore:
     """Restore frames of one size: pad, transform, multiply by a filter, transform back, crop.
 
@@ -214,59 +284,72 @@ class Restore:
         if self.family not in FAMILIES:
             raise InputError(f"family is '{family}': choose 'lanes' or 'groups'")
 
-        rows, columns = self.shape
         ny, nx = self.padded_shape
         row, column = _Transform.of(nx), _Transform.of(ny)
-        self._lanes = lanes = 64 // self._real.itemsize
-        self._blocks = -(-(nx // 2 + 1) // lanes)
-        row_blocks = -(-rows // (2 * lanes))
-        held = row_blocks * 2 * lanes
+        facts, real_bytes = device.facts, self._real.itemsize
+        if self.family == "lanes":
+            cut = _lanes(self.shape[0], nx, real_bytes)
+        else:
+            cut = _groups(
+                self.shape[0],
+                self.padded_shape,
+                real_bytes,
+                facts.local_memory_bytes,
+                facts.max_work_group_size,
+            )
         program = Program(
             device,
-            "restore_lanes.cl",
+            f"restore_{self.family}.cl",
             {
                 "REAL_IS_DOUBLE": self._real == np.float64,
-                "ROWS": rows,
-                "COLS": columns,
+                "ROWS": self.shape[0],
+                "COLS": self.shape[1],
                 "NX": nx,
                 "NY": ny,
-                "HELD": held,
-                "BLOCKS": self._blocks,
+                "HELD": cut.held,
+                "BLOCKS": cut.blocks,
                 **_io_defines(self.in_dtype, self.out_dtype),
+                **cut.defines,
             },
             generated=("restore_passes.h", _pass_lists(row, column)),
         )
 
-        frequency = np.arange(self._blocks * lanes)
+        frequency = np.arange(cut.blocks * cut.block)
         frequency[frequency > nx // 2] = 0
         place = row.position()
-        position = np.stack([place[frequency], place[(nx - frequency) % nx]])
+        places = device.upload(np.stack([place[frequency], place[(nx - frequency) % nx]]))
         self._order = device.upload(column.order())
-        self._spectrum = device.empty((self._blocks, held, 2, lanes), self._real)
-        tables = [self._table(t) for t in (row.turns(), column.turns())]
-        blends = [self._table(padding_weights(n - m, taper)) for n, m in ((nx, columns), (ny, rows))]
-        places = device.upload(position)
-        self._filter_shape = (self._blocks, ny, 2, lanes)
+        self._spectrum = device.empty((cut.blocks, cut.held, 2, cut.block), self._real)
+        row_turns, column_turns = self._table(row.turns()), self._table(column.turns())
+        row_blend = self._table(padding_weights(nx - self.shape[1], taper))
+        column_blend = self._table(padding_weights(ny - self.shape[0], taper))
+        self._filter_shape = (cut.blocks, ny, 2, cut.block)
         self._filters: dict[int, DeviceArray] = {}
 
+        rows, columns = (cut.row_groups * cut.row_items,), (cut.blocks * cut.column_items,)
+        row_items, column_items = (cut.row_items,), (cut.column_items,)
+        row_scratch = [self._scratch(n) for n in cut.row_scratch]
+        column_scratch = [self._scratch(n) for n in cut.column_scratch]
         self._rows_forward = program.launch(
-            "restore_rows_forward", (row_blocks,), (1,), None, self._spectrum, places, tables[0], blends[0]
-        )
+            "restore_rows_forward", rows, row_items,
+            None, self._spectrum, places, row_turns, row_blend, *row_scratch,
+        )  # fmt: skip
         self._columns = program.launch(
-            "restore_columns", (self._blocks,), (1,), self._spectrum, self._spectrum, None, tables[1], blends[1]
-        )
+            "restore_columns", columns, column_items,
+            self._spectrum, self._spectrum, None, column_turns, column_blend, *column_scratch,
+        )  # fmt: skip
         self._rows_inverse = program.launch(
-            "restore_rows_inverse", (row_blocks,), (1,), self._spectrum, None, places, tables[0]
-        )
+            "restore_rows_inverse", rows, row_items,
+            self._spectrum, None, places, row_turns, *row_scratch,
+        )  # fmt: skip
 
         wiener = Program(
             device,
             "wiener.cl",
-            {"REAL_IS_DOUBLE": self._real == np.float64, "WIENER_BLOCK": lanes, "WIENER_RUN": lanes},
+            {"REAL_IS_DOUBLE": self._real == np.float64, "WIENER_BLOCK": cut.block, "WIENER_RUN": cut.run},
         )
-        size = (self._blocks, 4)
-        i32, scale = np.int32, self._real.type(0.5 / (nx * ny))
-        zero = self._real.type(0)
+        size = (cut.blocks * cut.block // cut.run, 4 if cut.run > 1 else ny)
+        i32, scale, zero = np.int32, self._real.type(0.5 / (nx * ny)), self._real.type(0)
         self._form = wiener.launch(
             "wiener_axes", size, None, None, None, None, self._order, None,
             i32(ny), i32(nx), i32(0), i32(0), zero, scale,
@@ -463,6 +546,9 @@ class Restore:
     def _table(self, values: NDArray[np.float64]) -> DeviceArray:
         """Upload a table, never empty: a kernel's argument must name some memory."""
         return self.device.upload(np.append(values, 0.0).astype(self._real))
+
+    def _scratch(self, reals: int) -> DeviceArray | None:
+        return self.device.empty((reals,), self._real) if reals else None
 
     def _slot(self, slot: int) -> DeviceArray:
         if slot not in self._filters:
