@@ -144,7 +144,8 @@ class Design:
             )
         if self.exposure_s * self.frame_rate_hz >= 1:
             raise InputError(
-                f"exposure_s is {self.exposure_s}: shorter than a frame was wanted, {1 / self.frame_rate_hz:.4f} s"
+                f"exposure_s is {self.exposure_s}: at most the frame time was wanted, "
+                f"{1 / self.frame_rate_hz:.4f} s"
             )
         if not (self.region_rows <= self.rows and self.region_columns <= self.columns):
             raise InputError(
@@ -164,7 +165,7 @@ class Design:
 
     @property
     def aim_um(self) -> float:
-        """Where camera 2's sensor centre looks, as x': the middle of all that peg and hole can reach there (T3)."""
+        """Where camera 2's centre looks, as x': the middle of what peg and hole can reach there (T3)."""
         reach = self.hole.width_um / 2 + START_REACH_UM - self.peg.width_um / 2
         return (self.depth_range_um * math.sin(self.tilt_rad) + reach * math.cos(self.tilt_rad)) / 2
 

@@ -83,7 +83,7 @@ def _cells(
     return gaussian_filter(pattern.astype(np.float32), _EDGE_UM / PITCH_UM)
 
 
-def paint_plate(hole: HolePlate, rng: np.random.Generator) -> Painted:
+def paint_plate(hole: HolePlate, rng: np.random.Generator | None) -> Painted:
     """Paint the plate's top face: bright, grained, etched around the hole's corners; minus the background."""
     x, x0 = _axis(-hole.plate_width_um / 2, hole.plate_width_um / 2)
     y, y0 = _axis(-hole.plate_depth_um / 2, hole.plate_depth_um / 2)
@@ -91,7 +91,8 @@ def paint_plate(hole: HolePlate, rng: np.random.Generator) -> Painted:
     near_x = np.abs(np.abs(x) - hole.width_um / 2) < 5 * _CELL_UM
     near_y = np.abs(np.abs(y) - hole.depth_um / 2) < 5 * _CELL_UM
     face = np.full(shape, _PLATE - BACKGROUND, dtype=np.float32)
-    face += _grain(shape, 6.0, 0.02, rng) + _grain(shape, 40.0, 0.025, rng)
+    if rng is not None:
+        face += _grain(shape, 6.0, 0.02, rng) + _grain(shape, 40.0, 0.025, rng)
     # The etched marks are part of the design: alike in every world.
     face += 0.13 * _cells(x, y, np.random.default_rng(1), np.outer(near_y, near_x))
     opening = _box(x, y, hole.width_um, hole.depth_um)
@@ -101,17 +102,60 @@ def paint_plate(hole: HolePlate, rng: np.random.Generator) -> Painted:
     return Painted(face[None], (y0, x0), (-half[0], -half[1]), half)
 
 
-def paint_peg(peg: Peg, rng: np.random.Generator, *, side_um: float = 0.0) -> Painted:
+def paint_peg(peg: Peg, rng: np.random.Generator | None, *, side_um: float = 0.0) -> Painted:
     """Paint the peg's top face, and `side_um` of its +x side unfolded beside it; planes: radiance, cover."""
     half = (peg.width_um / 2, peg.depth_um / 2)
     x, x0 = _axis(-half[0], half[0] + side_um)
     y, y0 = _axis(-half[1], half[1])
     shape = (y.size, x.size)
     face = np.full(shape, _PEG, dtype=np.float32)
-    face += _grain((y.size, y.size * 2), 6.0, 0.02, rng)[:, : x.size]
+    if rng is not None:
+        face += _grain((y.size, y.size * 2), 6.0, 0.02, rng)[:, : x.size]
     face += 0.12 * _cells(x, y, np.random.default_rng(2), np.ones(shape, dtype=np.bool_))
     rows = _within(y, -half[1], half[1])
     top = np.outer(rows, _within(x, -half[0], half[0])).astype(np.float32)
     side = np.outer(rows, _within(x, half[0], half[0] + side_um)).astype(np.float32)
     planes = np.stack([face * top + _PEG_SIDE * side, top + side])
     return Painted(planes, (y0, x0), (-half[0], -half[1]), (half[0] + side_um, half[1]))
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A part's face as drawn, without the grain that no drawing shows.
+
+    Attributes
+    ----------
+    radiance : (rows, cols)
+        Brightness in [0, 1].
+    judged : (rows, cols)
+        Where a picture may be compared with it: inside the peg's rim; around the hole, not in it.
+    pitch_um, centre_yx
+        Sampling, and the index of the part's origin.
+    """
+
+    radiance: Plane
+    judged: NDArray[np.bool_]
+    pitch_um: float
+    centre_yx: tuple[float, float]
+
+
+def drawing_of(part: Peg | HolePlate) -> Drawing:
+    """Return a part's drawing, cut to where its etched marks are."""
+    painted = paint_peg(part, None) if isinstance(part, Peg) else paint_plate(part, None)
+    radiance = painted.planes[0]
+    y = (np.arange(radiance.shape[0]) - painted.centre_yx[0]) * PITCH_UM
+    x = (np.arange(radiance.shape[1]) - painted.centre_yx[1]) * PITCH_UM
+    far_x, far_y = np.abs(x)[None, :], np.abs(y)[:, None]
+    half_x, half_y = part.width_um / 2, part.depth_um / 2
+    if isinstance(part, Peg):
+        judged = (far_x < half_x - 15) & (far_y < half_y - 15)
+        return Drawing(radiance, judged, PITCH_UM, painted.centre_yx)
+    reach = 6 * _CELL_UM
+    judged = (
+        ((far_x > half_x - 20) | (far_y > half_y - 20)) & (far_x < half_x + reach) & (far_y < half_y + reach)
+    )
+    rows = np.flatnonzero(np.abs(y) < half_y + reach + 10)
+    columns = np.flatnonzero(np.abs(x) < half_x + reach + 10)
+    cut = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+    centre = (painted.centre_yx[0] - rows[0], painted.centre_yx[1] - columns[0])
+    return Drawing(radiance[cut], judged[cut], PITCH_UM, centre)

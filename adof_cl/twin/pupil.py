@@ -30,12 +30,17 @@ class PupilAxis:
         Phase tilt x + focus x^2 + alpha x^3, fitted; radians at the stop's edge.
     samples_rad
         The phase as the panel's pixels really show it, on equal cells across the stop; empty for glass.
+    order_rad, order_leak
+        Where the panel's first diffraction orders fall, in the unit of `reach_rad`, and the share of light
+        that its steps send there.
     """
 
     tilt_rad: float = 0.0
     focus_rad: float = 0.0
     alpha_rad: float = 0.0
     samples_rad: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    order_rad: float = 0.0
+    order_leak: float = 0.0
 
     def otf(self, u: NDArray[np.float64], psi_rad: float) -> NDArray[np.complex128]:
         """Evaluate the transfer function for an object defocused by `psi_rad`, mask included (T5, T6)."""
@@ -105,8 +110,7 @@ def read_codes(
         )
     rows, y = _inside(panel.rows, panel.pitch_um, aperture_um, panel.name)
     columns, x = _inside(panel.columns, panel.pitch_um, aperture_um, panel.name)
-    phase = panel.stroke_rad / 255 * codes[rows, columns].astype(np.float64)
-    field_ = np.exp(1j * phase)
+    field_ = np.exp(1j * panel.stroke_rad / 255 * np.arange(256))[codes[rows, columns]]
     along_x = _fit(x, np.angle((field_[:, 1:] * field_[:, :-1].conj()).sum(axis=0)))
     along_y = _fit(y, np.angle((field_[1:] * field_[:-1].conj()).sum(axis=1)))
     fx, fy = np.polyval([*along_x, 0], x), np.polyval([*along_y, 0], y)
@@ -126,8 +130,12 @@ def read_codes(
         at: NDArray[np.float64],
     ) -> PupilAxis:
         alpha, focus, tilt = (float(term) for term in fit)
-        samples = _cells(smooth + steps, at, panel.pitch_um, aperture_um) if pixels else np.zeros(0)
-        return PupilAxis(tilt, focus, alpha, samples)
+        if not pixels:
+            return PupilAxis(tilt, focus, alpha)
+        step = (3 * alpha * at**2 + 2 * focus * at + tilt) * 2 * panel.pitch_um / aperture_um
+        leak = 1 - float(np.mean(np.sinc(step / (2 * np.pi)) ** 2))
+        samples = _cells(smooth + steps, at, panel.pitch_um, aperture_um)
+        return PupilAxis(tilt, focus, alpha, samples, np.pi * aperture_um / panel.pitch_um, leak)
 
     return Pupil(axis(along_x, fx, step_x, x), axis(along_y, fy, step_y, y), residual)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-from scipy.ndimage import affine_transform
 
 from adof_cl.optics import OpticalSystem
 from adof_cl.twin.parts import PITCH_UM, Painted
@@ -15,6 +14,7 @@ from adof_cl.twin.pupil import Pupil, PupilAxis
 OVERSAMPLING = 3
 _MARGIN_PX = 14
 _BLOCK_PX = 16
+_MOST_LEAK = 0.03
 
 Planes = NDArray[np.float32]
 
@@ -73,6 +73,9 @@ class Layer:
         optics = self._optics
         per_rad = optics.wavelength_um * optics.f_number / (np.pi * optics.object_pitch_um)
         before, after = axis.reach_rad(psi_rad)
+        # Light the panel's steps send into its first orders lands this far away; little of it may wrap.
+        if axis.order_leak > _MOST_LEAK:
+            before, after = before - axis.order_rad, after + axis.order_rad
         first = low_px + before * per_rad - _MARGIN_PX
         last = high_px + after * per_rad + _MARGIN_PX
         size = _BLOCK_PX * int(np.ceil((last - first) / _BLOCK_PX))
@@ -118,13 +121,45 @@ def paint(
     middle = np.array([OVERSAMPLING * columns // 2, OVERSAMPLING * rows // 2])
     first = np.floor(middle + OVERSAMPLING * low).astype(int) - 3
     last = np.ceil(middle + OVERSAMPLING * high).astype(int) + 4
-    part_from_fine = np.linalg.inv(pixels_from_part) / (OVERSAMPLING * PITCH_UM)
-    flipped = part_from_fine[::-1, ::-1]
-    offset = np.array(part.centre_yx) + flipped @ (first - middle)[::-1]
+    step = np.linalg.inv(pixels_from_part)[::-1, ::-1] / (OVERSAMPLING * PITCH_UM)
+    start = np.asarray(np.array(part.centre_yx) + step @ (first - middle)[::-1], dtype=np.float64)
     for plane, target in zip(part.planes, fine, strict=True):
-        window = target[first[1] : last[1], first[0] : last[0]]
-        affine_transform(plane, flipped, offset, window.shape, output=window, order=1)
+        _interpolate(plane, step, start, target[first[1] : last[1], first[0] : last[0]])
     return fine
+
+
+def _interpolate(
+    plane: Planes, step: NDArray[np.float64], start: NDArray[np.float64], out: NDArray[np.float32]
+) -> None:
+    """Fill out[i, j] with the plane at start + step @ (i, j), linear between samples.
+
+    Three times as fast as the general routine of SciPy, which carries float64 through.
+    """
+    width = plane.shape[1]
+    flat = plane.ravel()
+    j = np.arange(out.shape[1])
+    along_j = [(step[axis, 1] * j).astype(np.float32) for axis in (0, 1)]
+    for block in range(0, out.shape[0], 64):
+        i = np.arange(block, min(block + 64, out.shape[0]))
+        y, x = (
+            np.clip(
+                (start[axis] + step[axis, 0] * i).astype(np.float32)[:, None] + along_j[axis],
+                0,
+                np.float32(plane.shape[axis] - 1.01),
+            )
+            for axis in (0, 1)
+        )
+        row, column = y.astype(np.int64), x.astype(np.int64)
+        y -= row
+        x -= column
+        index = row * width + column
+        upper = flat.take(index)
+        upper += x * (flat.take(index + 1) - upper)
+        index += width
+        lower = flat.take(index)
+        lower += x * (flat.take(index + 1) - lower)
+        upper += y * (lower - upper)
+        out[i[0] : i[-1] + 1] = upper
 
 
 def _sample(
