@@ -121,7 +121,8 @@ def paint(
     middle = np.array([OVERSAMPLING * columns // 2, OVERSAMPLING * rows // 2])
     first = np.floor(middle + OVERSAMPLING * low).astype(int) - 3
     last = np.ceil(middle + OVERSAMPLING * high).astype(int) + 4
-    step = np.linalg.inv(pixels_from_part)[::-1, ::-1] / (OVERSAMPLING * PITCH_UM)
+    inverse = np.asarray(np.linalg.inv(pixels_from_part), dtype=np.float64)
+    step = inverse[::-1, ::-1] / (OVERSAMPLING * PITCH_UM)
     start = np.asarray(np.array(part.centre_yx) + step @ (first - middle)[::-1], dtype=np.float64)
     for plane, target in zip(part.planes, fine, strict=True):
         _interpolate(plane, step, start, target[first[1] : last[1], first[0] : last[0]])
