@@ -18,6 +18,7 @@ Plane = NDArray[np.float32]
 PITCH_UM = 7.4 / 6
 _EDGE_UM = 1.5
 _CELL_UM = 30.0
+_SHEET = 128  # cells along a side of the sheet the marks are drawn from
 
 BACKGROUND = 0.05
 _HOLE = 0.08
@@ -78,8 +79,9 @@ def _cells(
     """Etched squares, each up or down at random: +-1 where `keep`, soft at their edges."""
     column = np.floor(x / _CELL_UM).astype(int)
     row = np.floor(y / _CELL_UM).astype(int)
-    signs = rng.choice(np.array([-1, 1], dtype=np.float32), size=(np.ptp(row) + 1, np.ptp(column) + 1))
-    pattern = np.where(keep, signs[np.ix_(row - row[0], column - column[0])], 0)
+    # One sheet of marks, counted from the part's origin: the same whatever else is painted beside it.
+    signs = rng.choice(np.array([-1, 1], dtype=np.float32), size=(_SHEET, _SHEET))
+    pattern = np.where(keep, signs[np.ix_(row + _SHEET // 2, column + _SHEET // 2)], 0)
     return gaussian_filter(pattern.astype(np.float32), _EDGE_UM / PITCH_UM)
 
 
@@ -148,7 +150,7 @@ def drawing_of(part: Peg | HolePlate) -> Drawing:
     far_x, far_y = np.abs(x)[None, :], np.abs(y)[:, None]
     half_x, half_y = part.width_um / 2, part.depth_um / 2
     if isinstance(part, Peg):
-        judged = (far_x < half_x - 15) & (far_y < half_y - 15)
+        judged = (far_x < half_x - 45) & (far_y < half_y - 45)
         return Drawing(radiance, judged, PITCH_UM, painted.centre_yx)
     reach = 6 * _CELL_UM
     judged = (
