@@ -38,6 +38,9 @@ class Calibration(Protocol):
     def name(self) -> str:
         """Which calibration this is, for reports."""
 
+    def covers(self, depth_um: float) -> bool:
+        """Say whether the calibration reaches that far; beyond, `alpha_rad` stays at its last value."""
+
     def alpha_rad(self, depth_um: float) -> float:
         """Return the weakest mask that covers `depth_um`; at least 0, never falling with depth."""
 
@@ -208,8 +211,9 @@ class ModelCalibration:
             1000 / (self.optics.wavelength_um * self.optics.f_number),
         )
         nu = np.linspace(0, finest, 2001)[1:]
-        values = np.array([_modulus(self._u(v), np.array([alpha_rad]), np.zeros(1))[0] for v in nu])
-        values *= np.array([self._pixel(v) for v in nu])
+        u = 2 * nu / 1000 * self.optics.wavelength_um * self.optics.f_number
+        values = _modulus(u, np.full(nu.shape, alpha_rad), np.zeros_like(nu))
+        values *= np.sinc(nu / 1000 * self.optics.object_pitch_um)
         below = np.flatnonzero(values < self.threshold)
         return float(nu[below[0]]) if below.size else finest
 
@@ -254,7 +258,8 @@ def choose_mask(
 
     Depths count from the plane in focus, negative towards the lens. A mask covers both sides alike, in
     defocus phase; the larger side decides. With `joint` the modulator also moves the focus to the middle of
-    the range (in phase), and the mask need only cover half of it.
+    the range (in phase), and the mask need only cover half of it. A range deeper than the calibration covers
+    gets the strongest mask it knows: ask `calibration.covers(depth_to_cover_um(...))`.
 
     Raises
     ------
@@ -267,22 +272,41 @@ def choose_mask(
     ------
     The paper's Eq. 4; docs/maths.md, eqs. O12 to O14.
     """
+    alpha = calibration.alpha_rad(depth_to_cover_um(near_um, far_um, optics, joint=joint))
+    return Mask(alpha_rad=alpha, focus_psi_rad=_focus(near_um, far_um, optics) if joint else 0.0)
+
+
+def depth_to_cover_um(near_um: float, far_um: float, optics: OpticalSystem, *, joint: bool = False) -> float:
+    """Return the one-sided depth, beyond the focus, that defocuses as much as the worse end of the range.
+
+    Raises
+    ------
+    InputError
+        Not finite, or near beyond far.
+    LimitError
+        No depth beyond the focus defocuses as much.
+    """
     require_finite(near_um=near_um, far_um=far_um)
     if near_um > far_um:
         raise InputError(f"near_um is {near_um}, far_um is {far_um}: near must not exceed far")
-    near, far = optics.psi_rad(near_um), optics.psi_rad(far_um)
-    focus = -(near + far) / 2 if joint else 0.0
-    reach = max(abs(near + focus), abs(far + focus))
+    focus = _focus(near_um, far_um, optics) if joint else 0.0
+    reach = max(abs(optics.psi_rad(near_um) + focus), abs(optics.psi_rad(far_um) + focus))
     try:
-        depth = optics.depth_um(reach)
+        return optics.depth_um(reach)
     except InputError as refusal:
-        raise LimitError(f"depths from {near_um} to {far_um} um defocus by {reach:.0f} rad: {refusal}") from (
-            refusal
-        )
-    return Mask(alpha_rad=calibration.alpha_rad(depth), focus_psi_rad=focus)
+        raise LimitError(
+            f"depths from {near_um:g} to {far_um:g} um defocus by {reach:.0f} rad, more than any depth beyond "
+            "the focus: choose a shallower range"
+        ) from refusal
 
 
-def _modulus(u: float, alpha: NDArray[np.float64], psi: NDArray[np.float64]) -> NDArray[np.float64]:
+def _focus(near_um: float, far_um: float, optics: OpticalSystem) -> float:
+    return 0.0 - (optics.psi_rad(near_um) + optics.psi_rad(far_um)) / 2  # not -0
+
+
+def _modulus(
+    u: float | NDArray[np.float64], alpha: NDArray[np.float64], psi: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """|H| of the square stop, eq. O4 with A(z) by the Faddeeva function; alpha, psi >= 0, 0 < u < 2."""
     b = 1 - u / 2
     c, q = 3 * alpha * u, psi * u
