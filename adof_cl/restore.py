@@ -309,6 +309,8 @@ class Restore:
                 "HELD": cut.held,
                 "BLOCKS": cut.blocks,
                 **_io_defines(self.in_dtype, self.out_dtype),
+                # A simulator checks every value's origin, and loses it in a compiler's own shuffles.
+                "RESTORE_PORTABLE": facts.simulated,
                 **cut.defines,
             },
             generated=("restore_passes.h", _pass_lists(row, column)),

@@ -76,44 +76,44 @@ typedef RESTORE_JOIN(OUT_TYPE, LANES) out_vec __attribute__((aligned(OUT_BYTES))
 // And one pass back: turn the other way, then the inverse butterfly.
 #define RESTORE_DEFINE_PASSES(R)                                                                            \
     RESTORE_INLINE void restore_forward##R(vec *re, vec *im, const int length, const int m,                 \
-                                           __global const real *turns)                                     \
+                                           __global const real *turns)                                      \
     {                                                                                                       \
         for (int b = 0; b < length; b += R * m)                                                             \
             for (int j = 0; j < m; ++j) {                                                                   \
                 vec xr[R], xi[R];                                                                           \
                 _Pragma("unroll")                                                                           \
                 for (int q = 0; q < R; ++q) {                                                               \
-                    xr[q] = re[b + j + q * m];                                                              \
-                    xi[q] = im[b + j + q * m];                                                              \
+                    xr[q] = re[2 * (b + j + q * m)];                                                        \
+                    xi[q] = im[2 * (b + j + q * m)];                                                        \
                 }                                                                                           \
                 restore_radix##R(xr, xi);                                                                   \
-                re[b + j] = xr[0];                                                                          \
-                im[b + j] = xi[0];                                                                          \
+                re[2 * (b + j)] = xr[0];                                                                    \
+                im[2 * (b + j)] = xi[0];                                                                    \
                 _Pragma("unroll")                                                                           \
                 for (int q = 1; q < R; ++q) {                                                               \
                     if (m == 1) {                                                                           \
-                        re[b + j + q * m] = xr[q];                                                          \
-                        im[b + j + q * m] = xi[q];                                                          \
+                        re[2 * (b + j + q * m)] = xr[q];                                                    \
+                        im[2 * (b + j + q * m)] = xi[q];                                                    \
                     } else {                                                                                \
                         const real c = turns[2 * (j * (R - 1) + q - 1)];                                    \
                         const real s = turns[2 * (j * (R - 1) + q - 1) + 1];                                \
-                        re[b + j + q * m] = xr[q] * c - xi[q] * s;                                          \
-                        im[b + j + q * m] = xr[q] * s + xi[q] * c;                                          \
+                        re[2 * (b + j + q * m)] = xr[q] * c - xi[q] * s;                                    \
+                        im[2 * (b + j + q * m)] = xr[q] * s + xi[q] * c;                                    \
                     }                                                                                       \
                 }                                                                                           \
             }                                                                                               \
     }                                                                                                       \
     RESTORE_INLINE void restore_back##R(vec *re, vec *im, const int length, const int m,                    \
-                                        __global const real *turns)                                        \
+                                        __global const real *turns)                                         \
     {                                                                                                       \
         for (int b = 0; b < length; b += R * m)                                                             \
             for (int j = 0; j < m; ++j) {                                                                   \
                 vec xr[R], xi[R];                                                                           \
-                xr[0] = re[b + j];                                                                          \
-                xi[0] = im[b + j];                                                                          \
+                xr[0] = re[2 * (b + j)];                                                                    \
+                xi[0] = im[2 * (b + j)];                                                                    \
                 _Pragma("unroll")                                                                           \
                 for (int q = 1; q < R; ++q) {                                                               \
-                    const vec r = re[b + j + q * m], i = im[b + j + q * m];                                 \
+                    const vec r = re[2 * (b + j + q * m)], i = im[2 * (b + j + q * m)];                     \
                     if (m == 1) {                                                                           \
                         xr[q] = r;                                                                          \
                         xi[q] = i;                                                                          \
@@ -127,20 +127,20 @@ typedef RESTORE_JOIN(OUT_TYPE, LANES) out_vec __attribute__((aligned(OUT_BYTES))
                 restore_radix##R(xi, xr);                                                                   \
                 _Pragma("unroll")                                                                           \
                 for (int q = 0; q < R; ++q) {                                                               \
-                    re[b + j + q * m] = xr[q];                                                              \
-                    im[b + j + q * m] = xi[q];                                                              \
+                    re[2 * (b + j + q * m)] = xr[q];                                                        \
+                    im[2 * (b + j + q * m)] = xi[q];                                                        \
                 }                                                                                           \
             }                                                                                               \
     }                                                                                                       \
-    /* The last pass forward, the filter and the first pass back, without leaving the registers. */        \
+    /* The last pass forward, the filter and the first pass back, without leaving the registers. */         \
     RESTORE_INLINE void restore_filter##R(vec *re, vec *im, const int length, __global const vec *filter)   \
     {                                                                                                       \
         for (int b = 0; b < length; b += R) {                                                               \
             vec xr[R], xi[R];                                                                               \
             _Pragma("unroll")                                                                               \
             for (int q = 0; q < R; ++q) {                                                                   \
-                xr[q] = re[b + q];                                                                          \
-                xi[q] = im[b + q];                                                                          \
+                xr[q] = re[2 * (b + q)];                                                                    \
+                xi[q] = im[2 * (b + q)];                                                                    \
             }                                                                                               \
             restore_radix##R(xr, xi);                                                                       \
             _Pragma("unroll")                                                                               \
@@ -152,8 +152,8 @@ typedef RESTORE_JOIN(OUT_TYPE, LANES) out_vec __attribute__((aligned(OUT_BYTES))
             restore_radix##R(xi, xr);                                                                       \
             _Pragma("unroll")                                                                               \
             for (int q = 0; q < R; ++q) {                                                                   \
-                re[b + q] = xr[q];                                                                          \
-                im[b + q] = xi[q];                                                                          \
+                re[2 * (b + q)] = xr[q];                                                                    \
+                im[2 * (b + q)] = xi[q];                                                                    \
             }                                                                                               \
         }                                                                                                   \
     }
@@ -180,23 +180,26 @@ RESTORE_DEFINE_PASSES(15)
 // since whatever stood there would leak its rounding errors into the row it shares a transform with.
 RESTORE_INLINE void restore_load_square(vec *v, __global const IN_TYPE *frame, const int row, const int col)
 {
+    vec square[LANES];
     _Pragma("unroll")
     for (int i = 0; i < LANES; ++i)
-        v[i] = row + i < ROWS
+        square[i] = row + i < ROWS
             ? RESTORE_CONVERT(*(__global const in_vec *)(frame + (size_t)(row + i) * COLS + col), SCALAR)
             : (vec)(0);
-    restore_transpose(v);
+    restore_transpose(square);
+    _Pragma("unroll")
+    for (int i = 0; i < LANES; ++i) v[2 * i] = square[i];
 }
 
 RESTORE_INLINE void restore_load(vec *v, __global const IN_TYPE *frame, const int row)
 {
 #if COLS >= LANES
-    for (int col = 0; col + LANES <= COLS; col += LANES) restore_load_square(v + col, frame, row, col);
-    if (COLS % LANES) restore_load_square(v + COLS - LANES, frame, row, COLS - LANES);
+    for (int col = 0; col + LANES <= COLS; col += LANES) restore_load_square(v + 2 * col, frame, row, col);
+    if (COLS % LANES) restore_load_square(v + 2 * (COLS - LANES), frame, row, COLS - LANES);
 #else
     for (int col = 0; col < COLS; ++col)
         for (int i = 0; i < LANES; ++i)
-            ((real *)&v[col])[i] = row + i < ROWS ? (real)frame[(row + i) * COLS + col] : (real)0;
+            ((real *)&v[2 * col])[i] = row + i < ROWS ? (real)frame[(row + i) * COLS + col] : (real)0;
 #endif
 }
 
@@ -215,7 +218,7 @@ RESTORE_INLINE void restore_store_square(const vec *lines, __global OUT_TYPE *im
 {
     vec v[LANES];
     _Pragma("unroll")
-    for (int i = 0; i < LANES; ++i) v[i] = lines[i];
+    for (int i = 0; i < LANES; ++i) v[i] = lines[2 * i];
     restore_transpose(v);
     _Pragma("unroll")
     for (int i = 0; i < LANES; ++i)
@@ -227,11 +230,11 @@ RESTORE_INLINE void restore_store_square(const vec *lines, __global OUT_TYPE *im
 RESTORE_INLINE void restore_store(const vec *v, __global OUT_TYPE *image, const int row)
 {
 #if COLS >= LANES
-    for (int col = 0; col + LANES <= COLS; col += LANES) restore_store_square(v + col, image, row, col);
-    if (COLS % LANES) restore_store_square(v + COLS - LANES, image, row, COLS - LANES);
+    for (int col = 0; col + LANES <= COLS; col += LANES) restore_store_square(v + 2 * col, image, row, col);
+    if (COLS % LANES) restore_store_square(v + 2 * (COLS - LANES), image, row, COLS - LANES);
 #else
     for (int col = 0; col < COLS; ++col) {
-        const vec rounded = restore_round(v[col]);
+        const vec rounded = restore_round(v[2 * col]);
         for (int i = 0; i < LANES; ++i)
             if (row + i < ROWS) image[(row + i) * COLS + col] = (OUT_TYPE)((const real *)&rounded)[i];
     }
@@ -246,31 +249,31 @@ RESTORE_KERNEL restore_rows_forward(
     __global const real    *restrict row_turns,
     __global const real    *restrict row_blend)
 {
-    vec re[NX], im[NX], v[LANES];
+    vec work[2 * NX], *re = work, *im = work + 1, v[LANES];
     const int row = 2 * LANES * get_global_id(0);
     restore_load(re, frame, row);
     restore_load(im, frame, row + LANES);
     for (int i = COLS; i < NX; ++i) {
         const real w = row_blend[i - COLS];
-        re[i] = re[COLS - 1] + w * (re[0] - re[COLS - 1]);
-        im[i] = im[COLS - 1] + w * (im[0] - im[COLS - 1]);
+        re[2 * i] = re[2 * (COLS - 1)] + w * (re[0] - re[2 * (COLS - 1)]);
+        im[2 * i] = im[2 * (COLS - 1)] + w * (im[0] - im[2 * (COLS - 1)]);
     }
     ROW_PASSES(ROW_FORWARD)
     // Two real rows in one complex transform come apart by symmetry; the factor 1/2 is in the filter.
     for (int block = 0; block < BLOCKS; ++block) {
         __global vec *out = spectrum + 2 * ((size_t)block * HELD + row);
         __global const int *here = position + block * LANES, *mirror = here + BLOCKS * LANES;
-        for (int i = 0; i < LANES; ++i) v[i] = re[here[i]] + re[mirror[i]];
+        for (int i = 0; i < LANES; ++i) v[i] = re[2 * here[i]] + re[2 * mirror[i]];
         restore_transpose(v);
         for (int i = 0; i < LANES; ++i) out[2 * i] = v[i];
-        for (int i = 0; i < LANES; ++i) v[i] = im[here[i]] - im[mirror[i]];
+        for (int i = 0; i < LANES; ++i) v[i] = im[2 * here[i]] - im[2 * mirror[i]];
         restore_transpose(v);
         for (int i = 0; i < LANES; ++i) out[2 * i + 1] = v[i];
         out += 2 * LANES;
-        for (int i = 0; i < LANES; ++i) v[i] = im[here[i]] + im[mirror[i]];
+        for (int i = 0; i < LANES; ++i) v[i] = im[2 * here[i]] + im[2 * mirror[i]];
         restore_transpose(v);
         for (int i = 0; i < LANES; ++i) out[2 * i] = v[i];
-        for (int i = 0; i < LANES; ++i) v[i] = re[mirror[i]] - re[here[i]];
+        for (int i = 0; i < LANES; ++i) v[i] = re[2 * mirror[i]] - re[2 * here[i]];
         restore_transpose(v);
         for (int i = 0; i < LANES; ++i) out[2 * i + 1] = v[i];
     }
@@ -284,26 +287,26 @@ RESTORE_KERNEL restore_columns(
     __global const real *restrict column_turns,
     __global const real *restrict column_blend)
 {
-    vec re[NY], im[NY];
+    vec work[2 * NY], *re = work, *im = work + 1;
     const size_t block = get_global_id(0);
     __global const vec *source = spectrum + 2 * block * HELD;
     __global const vec *block_filter = filter + 2 * block * NY;
     for (int y = 0; y < ROWS; ++y) {
-        re[y] = source[2 * y];
-        im[y] = source[2 * y + 1];
+        re[2 * y] = source[2 * y];
+        im[2 * y] = source[2 * y + 1];
     }
     for (int y = ROWS; y < NY; ++y) {
         const real w = column_blend[y - ROWS];
-        re[y] = re[ROWS - 1] + w * (re[0] - re[ROWS - 1]);
-        im[y] = im[ROWS - 1] + w * (im[0] - im[ROWS - 1]);
+        re[2 * y] = re[2 * (ROWS - 1)] + w * (re[0] - re[2 * (ROWS - 1)]);
+        im[2 * y] = im[2 * (ROWS - 1)] + w * (im[0] - im[2 * (ROWS - 1)]);
     }
     COLUMN_PASSES(COLUMN_FORWARD)
     COLUMN_LAST(COLUMN_FILTER)
     COLUMN_PASSES_BACK(COLUMN_BACK)
     __global vec *out = filtered + 2 * block * HELD;
     for (int y = 0; y < ROWS; ++y) {
-        out[2 * y] = re[y];
-        out[2 * y + 1] = im[y];
+        out[2 * y] = re[2 * y];
+        out[2 * y + 1] = im[2 * y];
     }
     for (int y = 2 * ROWS; y < 2 * HELD; ++y) out[y] = (vec)(0);
 }
@@ -315,7 +318,7 @@ RESTORE_KERNEL restore_rows_inverse(
     __global const int  *restrict position,
     __global const real *restrict row_turns)
 {
-    vec re[NX], im[NX], ar[LANES], ai[LANES], br[LANES], bi[LANES];
+    vec work[2 * NX], *re = work, *im = work + 1, ar[LANES], ai[LANES], br[LANES], bi[LANES];
     const int row = 2 * LANES * get_global_id(0);
     for (int block = 0; block < BLOCKS; ++block) {
         __global const vec *in = filtered + 2 * ((size_t)block * HELD + row);
@@ -332,11 +335,11 @@ RESTORE_KERNEL restore_rows_inverse(
         __global const int *here = position + block * LANES, *mirror = here + BLOCKS * LANES;
         for (int i = 0; i < LANES && block * LANES + i <= NX / 2; ++i) {
             const int p = here[i], q = mirror[i];
-            re[p] = p == q ? ar[i] : ar[i] - bi[i];     // a bin that mirrors itself is real
-            im[p] = p == q ? br[i] : ai[i] + br[i];
+            re[2 * p] = p == q ? ar[i] : ar[i] - bi[i];     // a bin that mirrors itself is real
+            im[2 * p] = p == q ? br[i] : ai[i] + br[i];
             if (p != q) {
-                re[q] = ar[i] + bi[i];
-                im[q] = br[i] - ai[i];
+                re[2 * q] = ar[i] + bi[i];
+                im[2 * q] = br[i] - ai[i];
             }
         }
     }
