@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
-from scipy import ndimage
+from scipy import ndimage, special
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError, TrackingError
@@ -631,3 +631,234 @@ class TemplateTracker:
 def _full_scale(dtype: DTypeLike) -> float:
     kind = np.dtype(dtype)
     return 1.0 if kind == np.float32 else float(np.iinfo(kind).max)
+
+
+@dataclass(frozen=True)
+class Corner:
+    """Where two straight edges meet.
+
+    Attributes
+    ----------
+    xy_px : (2,)
+        Column and row; pixel centres at integers.
+    covariance : (2, 2)
+        Of `xy_px`, px^2.
+    edges_rad : (2,)
+        Angle of each edge from the x axis, towards y: the one nearer the rows, the one nearer the columns.
+    """
+
+    xy_px: Array
+    covariance: Array
+    edges_rad: Array
+
+
+@dataclass(frozen=True)
+class _Edge:
+    """across = offset + slope * along, from the guess; covariance of (offset, slope)."""
+
+    offset: float
+    slope: float
+    blur: float
+    covariance: Array
+
+
+_STEEPEST = math.tan(math.radians(15))
+_STRIP_PX = 2.5  # half width of the strip an edge is fitted in: the step and no more
+_STRETCH_PX = 4  # of the edge share one pair of grey levels
+
+
+def locate_corner(
+    image: NDArray[Any],
+    guess_xy_px: ArrayLike,
+    *,
+    reach_px: float = 4.0,
+    arm_px: float = 30.0,
+    sigma_limit_px: float = 0.1,
+) -> Corner:
+    """Locate the corner of a part, to a few hundredths of a pixel, in an image taken in focus.
+
+    An edge near the rows and one near the columns are found on whichever side of the guess they run, each is
+    fitted as a blurred step in a strip of pixels along it, robustly, and the two lines are intersected.
+
+    Parameters
+    ----------
+    image : (rows, columns)
+        In focus; any real type.
+    guess_xy_px : (2,)
+        Column and row of the corner.
+    reach_px
+        How far the guess may be off along either axis.
+    arm_px
+        Length of each edge to use; the part's edges must be at least this long.
+    sigma_limit_px
+        The corner is refused when its standard deviation exceeds this.
+
+    Raises
+    ------
+    InputError
+        The image has another shape, or is not finite, or the guess is too near its border.
+    TrackingError
+        No corner: no edge, an edge that runs on through the guess, or one too uncertain.
+
+    Source
+    ------
+    docs/maths.md, eq. S13.
+    """
+    if image.ndim != 2:
+        raise InputError(f"an image of {image.ndim} axes came: (rows, columns) was wanted")
+    require_positive(reach_px=reach_px, arm_px=arm_px, sigma_limit_px=sigma_limit_px)
+    guess = np.asarray(guess_xy_px, dtype=np.float64)
+    if guess.shape != (2,) or not np.isfinite(guess).all():
+        raise InputError(f"guess_xy_px is {guess.tolist()}: a finite column and row were wanted")
+    reach = math.ceil(reach_px + arm_px * (1 + _STEEPEST) + _STRIP_PX)
+    origin = np.rint(guess).astype(np.int64)
+    low = np.maximum(origin - reach, 0)
+    values = image[low[1] : max(origin[1] + reach + 1, 0), low[0] : max(origin[0] + reach + 1, 0)]
+    if min(values.shape) < 10:
+        raise InputError(
+            f"the guess {guess.tolist()} lies at the border of an image of {image.shape}: choose a corner "
+            "inside"
+        )
+    values = values.astype(np.float64)
+    if not np.isfinite(values).all():
+        raise InputError("the image holds values that are not finite around the guess: restore it anew")
+
+    x, y = guess - low
+    row_side, row_slope, row_offset = _find_edge(values, x, y, reach_px, arm_px)
+    column_side, column_slope, column_offset = _find_edge(values.T, y, x, reach_px, arm_px)
+    along_rows = _Edge(row_offset, row_slope, 0.5, np.zeros((2, 2)))
+    along_columns = _Edge(column_offset, column_slope, 0.5, np.zeros((2, 2)))
+    for _ in range(2):  # where each edge begins depends on where the other is
+        (dx, dy), _ = _meet(along_rows, along_columns)
+        blur = max(along_rows.blur, along_columns.blur)
+        skip = 1.5 + 2 * blur + _STRIP_PX * max(abs(along_rows.slope), abs(along_columns.slope))
+        along_rows, along_columns = (
+            _fit_edge(values, x, y, along_rows, row_side, row_side * dx + skip, arm_px),
+            _fit_edge(values.T, y, x, along_columns, column_side, column_side * dy + skip, arm_px),
+        )
+    (dx, dy), covariance = _meet(along_rows, along_columns)
+    sigma = math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
+    if sigma > sigma_limit_px or max(abs(dx), abs(dy)) > reach_px + 1:
+        raise TrackingError(
+            f"no corner lies within {reach_px:g} px of {guess.tolist()}: its place came out {dx:+.1f}, "
+            f"{dy:+.1f} px off and uncertain by {sigma:.2g} px, so give a nearer guess or a sharper image"
+        )
+    return Corner(
+        xy_px=guess + np.array([dx, dy]),
+        covariance=covariance,
+        edges_rad=np.array([math.atan(along_rows.slope), math.pi / 2 - math.atan(along_columns.slope)]),
+    )
+
+
+def _find_edge(
+    values: Array, along: float, across: float, reach: float, arm: float
+) -> tuple[int, float, float]:
+    """Find the straight edge along axis 1 that is strongest on one side: (side, slope, offset)."""
+    rise = ndimage.gaussian_filter(values, (1.5, 1.0), order=(1, 0))
+    slopes = np.linspace(-_STEEPEST, _STEEPEST, 31)
+    offsets = np.arange(-reach, reach + 0.25, 0.5)
+    found: list[tuple[float, int, float, float, float]] = []
+    for side in (1, -1):
+        t = side * np.arange(reach + 2, max(arm, reach + 10))
+        t = t[(along + t >= 1) & (along + t <= values.shape[1] - 2)]
+        if t.size < 8:
+            continue
+
+        def strength(t: Array) -> Array:
+            rows = across + offsets[None, :, None] + slopes[:, None, None] * t
+            columns = np.broadcast_to(along + t, rows.shape)
+            grey = ndimage.map_coordinates(rise, [rows, columns], order=1, mode="nearest")
+            return np.asarray(grey.mean(axis=-1), dtype=np.float64)
+
+        here = strength(t)
+        i, j = np.unravel_index(int(np.abs(here).argmax()), here.shape)
+        beyond = float(strength(-t)[i, j])  # the same line on the other side
+        found.append((float(abs(here[i, j])), side, slopes[i], offsets[j], beyond * np.sign(here[i, j])))
+    if not found:
+        raise TrackingError("the image ends too near the guess on both sides: choose a corner farther inside")
+    best, side, slope, offset, beyond = max(found)
+    if best <= 0 or beyond > 0.5 * best:
+        raise TrackingError(
+            "no corner is there: an edge runs straight through the guess, so choose the end of an edge"
+            if best > 0
+            else "no corner is there: the image is flat around the guess, so choose a place with contrast"
+        )
+    return side, float(slope), float(offset)
+
+
+def _fit_edge(
+    values: Array, along: float, across: float, edge: _Edge, side: int, start: float, arm: float
+) -> _Edge:
+    """Fit a blurred step to the pixels along an edge: Gauss-Newton with Huber's weights."""
+    columns = np.arange(values.shape[1])
+    t = columns - along
+    columns = columns[(side * t >= start) & (side * t <= start + arm)]
+    rows = np.arange(values.shape[0])[:, None]
+    t = np.broadcast_to(columns - along, (values.shape[0], columns.size))
+    distance = rows - across - edge.offset - edge.slope * t
+    strip = np.abs(distance) <= _STRIP_PX
+    t, d, grey = t[strip], (rows - across + 0 * t)[strip], values[:, columns][strip]
+    if np.unique(t).size < 8:
+        raise TrackingError(
+            "the image ends too near the guess: choose a corner farther inside or shorter arms"
+        )
+
+    # Levels are free every few columns: texture that brightens a stretch of the edge must not bend it.
+    stretch = np.asarray((side * t - start) // _STRETCH_PX, dtype=np.int64)
+    stretch = np.minimum(stretch, max(int(side * t[-1] - start + 1) // _STRETCH_PX - 1, 0))
+    count = int(stretch.max()) + 1
+    member = np.eye(count)[stretch]
+    p = np.array([edge.offset, edge.slope, edge.blur])
+    most = np.array([1, 0.1, 0.5])
+    weights = np.ones_like(grey)
+    for _ in range(25):
+        # A blurred step averaged over a pixel, its slope across and by the blur.
+        middle = d - p[0] - p[1] * t
+        above, under = (middle + 0.5) / p[2], (middle - 0.5) / p[2]
+        cover = special.ndtr(above) - special.ndtr(under)
+        bells = (np.exp(-above * above / 2) - np.exp(-under * under / 2)) / math.sqrt(2 * math.pi)
+        shape = p[2] * bells + (middle + 0.5) * special.ndtr(above) - (middle - 0.5) * special.ndtr(under)
+        levels = np.concatenate([member * (1 - shape)[:, None], member * shape[:, None]], axis=1)
+        weighted = levels * weights[:, None]
+        fitted = np.linalg.solve(weighted.T @ levels + 1e-9 * np.eye(2 * count), weighted.T @ grey)
+        contrast = (fitted[count:] - fitted[:count])[stretch]
+        left = grey - levels @ fitted
+        slopes = np.stack([-cover, -cover * t, bells], axis=1) * contrast[:, None]
+        slopes -= levels @ np.linalg.solve(
+            weighted.T @ levels + 1e-9 * np.eye(2 * count), weighted.T @ slopes
+        )
+        scale = 1.4826 * float(np.median(np.abs(left))) + 1e-12
+        weights = np.minimum(1, 1.5 * scale / np.maximum(np.abs(left), 1e-300))
+        normal = (slopes * weights[:, None]).T @ slopes + 1e-12 * np.eye(3)
+        step = np.linalg.solve(normal, slopes.T @ (weights * left))
+        p = p + np.clip(step, -most, most)
+        p[2] = min(max(p[2], 0.1), _STRIP_PX / 2)
+        if abs(step[0]) < 1e-4 and abs(step[1]) < 1e-5:
+            break
+    variance = float((weights * left * left).sum() / max(weights.sum() - 3 - 2 * count, 1))
+    # Texture is alike in neighbouring columns; what their scores share makes them worth less.
+    order = np.unique(t, return_inverse=True)[1]
+    scores = np.bincount(order, slopes[:, 0] * weights * left)
+    power = max(float(scores @ scores), 1e-300)
+    shared = sum(float(scores[lag:] @ scores[:-lag]) for lag in (1, 2, 3)) / power
+    inflation = min(max(1 + 2 * shared, 1.0), 6.0)
+    covariance = np.linalg.pinv(normal)[:2, :2] * variance * inflation
+    rise = float(np.median(np.abs(fitted[count:] - fitted[:count])))
+    if not np.isfinite(p).all() or rise < 3 * math.sqrt(variance):
+        raise TrackingError(
+            f"no corner is there: an edge of {rise:.3g} grey levels does not rise above "
+            f"{math.sqrt(variance):.3g} of noise and texture, so choose a place with contrast"
+        )
+    return _Edge(float(p[0]), float(p[1]), float(p[2]), covariance)
+
+
+def _meet(along_rows: _Edge, along_columns: _Edge) -> tuple[tuple[float, float], Array]:
+    """Intersect y = a + b x with x = c + d y; return (x, y) and its covariance."""
+    a, b = along_rows.offset, along_rows.slope
+    c, d = along_columns.offset, along_columns.slope
+    divisor = 1 - b * d
+    x, y = (c + d * a) / divisor, (a + b * c) / divisor
+    by_rows = np.array([[d, d * x], [1, x]]) / divisor
+    by_columns = np.array([[1, y], [b, b * y]]) / divisor
+    covariance = by_rows @ along_rows.covariance @ by_rows.T
+    return (x, y), covariance + by_columns @ along_columns.covariance @ by_columns.T
