@@ -165,9 +165,9 @@ class Design:
 
     @property
     def aim_um(self) -> float:
-        """Where camera 2's centre looks, as x': the middle of what peg and hole can reach there (T3)."""
-        reach = self.hole.width_um / 2 + START_REACH_UM - self.peg.width_um / 2
-        return (self.depth_range_um * math.sin(self.tilt_rad) + reach * math.cos(self.tilt_rad)) / 2
+        """Where camera 2's centre looks, as x': midway between the hole docked and farthest (T3)."""
+        far = self.depth_range_um * math.sin(self.tilt_rad) + START_REACH_UM * math.cos(self.tilt_rad)
+        return far / 2
 
     @property
     def mask_2(self) -> Mask:

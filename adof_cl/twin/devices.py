@@ -168,7 +168,7 @@ class SimulatedCamera:
         if self._noise:
             rng = np.random.default_rng([self._seed, self.number, number])
             noise = rng.standard_normal(self._shape, dtype=np.float32)
-            # Photon noise of a thousand electrons or more is Gaussian to better than its own rounding.
+            # Photon noise of the background, 900 electrons, is Gaussian to better than its own rounding.
             electrons += noise * np.sqrt(np.maximum(electrons, 0) + np.float32(design.read_noise_e**2))
         levels = np.rint(electrons * np.float32(255 / design.full_well_e))
         return np.asarray(np.clip(levels, 0, 255), dtype=np.uint8)

@@ -54,7 +54,8 @@ def _axis(low_um: float, high_um: float) -> tuple[NDArray[np.float64], float]:
 
 
 def _within(x: NDArray[np.float64], low: float, high: float) -> NDArray[np.float64]:
-    soft = np.sqrt(2) * _EDGE_UM
+    # Linear interpolation adds a variance of a sixth of a sample squared, on average.
+    soft = np.sqrt(2 * (_EDGE_UM**2 - PITCH_UM**2 / 6))
     return np.asarray((erf((x - low) / soft) - erf((x - high) / soft)) / 2)
 
 

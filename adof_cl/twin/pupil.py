@@ -134,7 +134,9 @@ def read_codes(
             return PupilAxis(tilt, focus, alpha)
         step = (3 * alpha * at**2 + 2 * focus * at + tilt) * 2 * panel.pitch_um / aperture_um
         leak = 1 - float(np.mean(np.sinc(step / (2 * np.pi)) ** 2))
-        samples = _cells(smooth + steps, at, panel.pitch_um, aperture_um)
+        pitch = at[1] - at[0]
+        beyond = np.polyval([*fit, 0], [at[0] - pitch, at[-1] + pitch])
+        samples = _cells(smooth + steps, at, beyond, panel.pitch_um, aperture_um)
         return PupilAxis(tilt, focus, alpha, samples, np.pi * aperture_um / panel.pitch_um, leak)
 
     return Pupil(axis(along_x, fx, step_x, x), axis(along_y, fy, step_y, y), residual)
@@ -146,7 +148,7 @@ def _inside(count: int, pitch_um: float, aperture_um: float, name: str) -> tuple
         raise InputError(
             f"panel {name} is {count * pitch_um:.0f} um wide: the stop of {aperture_um:.0f} um does not fit"
         )
-    # The last fraction of a pixel at the stop's edge carries no code of its own; see _cells.
+    # A pixel the stop cuts through may or may not carry a code; the fit does without it.
     kept = np.flatnonzero(np.abs(x) <= 1)
     return slice(int(kept[0]), int(kept[-1]) + 1), np.asarray(x[kept], dtype=np.float64)
 
@@ -157,9 +159,15 @@ def _fit(x: NDArray[np.float64], steps_rad: NDArray[np.float64]) -> NDArray[np.f
 
 
 def _cells(
-    phase_rad: NDArray[np.float64], x: NDArray[np.float64], pitch_um: float, aperture_um: float
+    phase_rad: NDArray[np.float64],
+    x: NDArray[np.float64],
+    beyond_rad: NDArray[np.float64],
+    pitch_um: float,
+    aperture_um: float,
 ) -> NDArray[np.float64]:
+    """Spread the pixels' phase over equal cells; `beyond_rad` is that of the pixels the stop cuts through."""
     count = int(np.ceil(aperture_um / pitch_um * _SAMPLES_PER_PIXEL))
     at = (2 * np.arange(count) + 1 - count) / count
-    nearest = np.rint((at - x[0]) / (x[1] - x[0])).astype(int)
-    return np.asarray(phase_rad[np.clip(nearest, 0, x.size - 1)])
+    nearest = np.rint((at - x[0]) / (x[1] - x[0])).astype(int) + 1
+    every = np.concatenate([beyond_rad[:1], phase_rad, beyond_rad[1:]])
+    return np.asarray(every[np.clip(nearest, 0, every.size - 1)])
