@@ -8,10 +8,7 @@ keeps in slots. A call only enqueues. Two kernel families do the same arithmetic
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,134 +16,14 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError
-from adof_cl.program import Launch, Program
+from adof_cl.fft_passes import Passes, pass_lists
+from adof_cl.noise import checked_nsr
+from adof_cl.padding import checked_frame_shape, padded_shape, padding_weights
+from adof_cl.program import Program
 
-SMALLEST_SIDE = 8
-LARGEST_SIDE = 4096
-LARGEST_PADDED_SIDE = 16384
 FAMILIES = ("lanes", "groups")
 
 _C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float", "float64": "double"}
-
-# Vector operations per sample of each small transform, counted from restore_butterflies.h; a pass adds its
-# twiddles, loads and stores.
-_OPERATIONS = {2: 2, 3: 5.3, 4: 4, 5: 7.2, 6: 7.3, 7: 9.4, 8: 7, 9: 12.4, 10: 9.2, 12: 9.3, 15: 12.5}
-_PASS_COST = 8.0
-
-
-def good_size(at_least: int) -> int:
-    """Return the smallest length from `at_least` on whose prime factors are 2, 3, 5 and 7."""
-    n = max(1, at_least)
-    while True:
-        rest = n
-        for prime in (2, 3, 5, 7):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return n
-        n += 1
-
-
-@lru_cache(maxsize=256)
-def _radices(n: int) -> tuple[int, ...]:
-    """Split a transform into the passes that cost least, largest first."""
-
-    @lru_cache(maxsize=None)
-    def best(rest: int, largest: int) -> tuple[float, tuple[int, ...]]:
-        if rest == 1:
-            return 0.0, ()
-        found: tuple[float, tuple[int, ...]] = (math.inf, ())
-        for radix, operations in _OPERATIONS.items():
-            if radix <= largest and rest % radix == 0:
-                cost, tail = best(rest // radix, radix)
-                found = min(found, (cost + operations + _PASS_COST, (radix, *tail)))
-        return found
-
-    return best(n, max(_OPERATIONS))[1]
-
-
-@dataclass(frozen=True)
-class _Transform:
-    """How one axis is transformed in place: decimation in frequency, docs/maths.md, eq. W6.
-
-    Attributes
-    ----------
-    length
-        Samples.
-    radices
-        Of the passes, in forward order.
-    """
-
-    length: int
-    radices: tuple[int, ...]
-
-    @classmethod
-    def of(cls, length: int) -> _Transform:
-        return cls(length, _radices(length))
-
-    def passes(self) -> list[tuple[int, int, int]]:
-        """Return (radix, stride, offset of its twiddles in `turns`) of each pass."""
-        listed, rest, offset = [], self.length, 0
-        for radix in self.radices:
-            rest //= radix
-            listed.append((radix, rest, offset))
-            offset += 2 * (radix - 1) * rest
-        return listed
-
-    def turns(self) -> NDArray[np.float64]:
-        """Return cos and -sin of 2 pi j q / (radix * stride): pass by pass, j, then q from 1."""
-        pieces = []
-        for radix, stride, _ in self.passes():
-            j, q = np.arange(stride)[:, None], np.arange(1, radix)[None, :]
-            angle = 2 * np.pi * (j * q % (radix * stride)) / (radix * stride)
-            pieces.append(np.stack([np.cos(angle), -np.sin(angle)], axis=-1).ravel())
-        return np.concatenate(pieces)
-
-    def position(self) -> NDArray[np.int32]:
-        """Return where each frequency lies after the passes."""
-        frequency = np.arange(self.length)
-        place = np.zeros(self.length, dtype=np.int64)
-        for radix, stride, _ in self.passes():
-            place += frequency % radix * stride
-            frequency //= radix
-        return place.astype(np.int32)
-
-    def order(self) -> NDArray[np.int32]:
-        """Return which frequency lies at each place: the inverse of `position`."""
-        order = np.empty(self.length, dtype=np.int32)
-        order[self.position()] = np.arange(self.length, dtype=np.int32)
-        return order
-
-
-def _pass_lists(row: _Transform, column: _Transform) -> str:
-    """Write the passes as macro lists: C can loop over them only if the radix is a literal."""
-
-    def listed(name: str, passes: Sequence[tuple[int, int, int]]) -> str:
-        return f"#define {name}(P) " + " ".join(f"P({r}, {m}, {t})" for r, m, t in passes)
-
-    rows, columns = row.passes(), column.passes()
-    return "\n".join(
-        [
-            listed("ROW_PASSES", rows),
-            listed("ROW_PASSES_BACK", rows[::-1]),
-            listed("COLUMN_PASSES", columns[:-1]),
-            listed("COLUMN_PASSES_BACK", columns[-2::-1]),
-            f"#define COLUMN_LAST(P) P({columns[-1][0]})",
-            "",
-        ]
-    )
-
-
-def padding_weights(samples: int, taper: bool) -> NDArray[np.float64]:
-    """Return the share of the near edge in each sample of the padding (docs/maths.md, eq. W4).
-
-    The padding lies behind the far edge and, the transform being periodic, before the near one: it starts as
-    a copy of the far edge (0) and ends as a copy of the near edge (1), by a raised cosine or by a step.
-    """
-    t = np.arange(samples)
-    if taper:
-        return np.asarray(np.sin(np.pi / 2 * (t + 1) / (samples + 1)) ** 2, dtype=np.float64)
-    return (t >= samples - samples // 2).astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -187,9 +64,7 @@ def _lanes(rows: int, nx: int, real_bytes: int) -> _Cut:
     return _Cut(lanes, blocks, row_groups * 2 * lanes, row_groups, 1, 1, lanes, {})
 
 
-def _groups(
-    rows: int, padded: tuple[int, int], real_bytes: int, local_bytes: int, most_items: int
-) -> _Cut:
+def _groups(rows: int, padded: tuple[int, int], real_bytes: int, local_bytes: int, most_items: int) -> _Cut:
     """Divide for work-groups, within local memory and the largest group.
 
     Columns: the widest block of up to 64 bytes that fits local memory, down to one column. An axis of which
@@ -258,7 +133,7 @@ class Restore:
 
     Source
     ------
-    Paper eq. (3) as corrected in docs/maths.md, eqs W1 to W6.
+    Paper eq. (3) as corrected in docs/maths.md, eqs. W1 to W5.
     """
 
     def __init__(
@@ -274,7 +149,7 @@ class Restore:
         family: str | None = None,
     ) -> None:
         self.device = device
-        self.shape = _checked_shape(shape)
+        self.shape = checked_frame_shape(shape)
         self.padded_shape = padded_shape(shape, padding)
         self._real = device.real_type(precision)
         self._complex = np.dtype(np.result_type(self._real, np.complex64))
@@ -285,7 +160,7 @@ class Restore:
             raise InputError(f"family is '{family}': choose 'lanes' or 'groups'")
 
         ny, nx = self.padded_shape
-        row, column = _Transform.of(nx), _Transform.of(ny)
+        row, column = Passes.of(nx), Passes.of(ny)
         facts, real_bytes = device.facts, self._real.itemsize
         if self.family == "lanes":
             cut = _lanes(self.shape[0], nx, real_bytes)
@@ -313,7 +188,8 @@ class Restore:
                 "RESTORE_PORTABLE": facts.simulated,
                 **cut.defines,
             },
-            generated=("restore_passes.h", _pass_lists(row, column)),
+            generated=("restore_passes.h", pass_lists(row, column)),
+            options=_options(device),
         )
 
         frequency = np.arange(cut.blocks * cut.block)
@@ -349,6 +225,7 @@ class Restore:
             device,
             "wiener.cl",
             {"REAL_IS_DOUBLE": self._real == np.float64, "WIENER_BLOCK": cut.block, "WIENER_RUN": cut.run},
+            options=_options(device),
         )
         size = (cut.blocks * cut.block // cut.run, 4 if cut.run > 1 else ny)
         i32, scale, zero = np.int32, self._real.type(0.5 / (nx * ny)), self._real.type(0)
@@ -363,6 +240,8 @@ class Restore:
         self._h_cols = device.empty((nx,), self._complex)
         self._noise: DeviceArray | None = None
         self._gain: DeviceArray | None = None
+        self._filtered: DeviceArray | None = None
+        self._transformed = False
         self._frame: DeviceArray | None = None
         self._image: DeviceArray | None = None
 
@@ -388,7 +267,7 @@ class Restore:
         ny, nx = self.padded_shape
         rows = _checked_axis("h_rows", h_rows, ny).astype(self._complex)
         cols = _checked_axis("h_cols", h_cols, nx).astype(self._complex)
-        noise = _checked_nsr(nsr, (ny, nx // 2 + 1))
+        noise = checked_nsr(nsr, (ny, nx // 2 + 1))
         slot = _checked_slot(slot)
         level: float | DeviceArray
         if noise.ndim == 0:
@@ -429,8 +308,8 @@ class Restore:
         ):
             if table.dtype != self._complex or table.shape[-1] != length or len(table.shape) > 2:
                 raise InputError(
-                    f"{name} is {table.shape} {table.dtype}, ({length},) or (k, {length}) {self._complex} was "
-                    "wanted: sample the OTF at the padded size"
+                    f"{name} is {table.shape} {table.dtype}, ({length},) or (k, {length}) {self._complex} "
+                    "was wanted: sample the OTF at the padded size"
                 )
             entries = table.size // length
             if not 0 <= entry < entries:
@@ -444,7 +323,7 @@ class Restore:
             self._form.set(2, nsr)
         else:
             self._form.set(2, None)
-            self._form.set(9, self._real.type(float(_checked_nsr(nsr, None))))
+            self._form.set(9, self._real.type(checked_nsr(float(nsr), (ny, nx // 2 + 1))))
         self._form.set(0, h_rows)
         self._form.set(1, h_cols)
         self._form.set(4, self._slot(slot))
@@ -507,21 +386,40 @@ class Restore:
         InputError
             Another shape or type, or an empty slot; nothing is enqueued.
         """
-        for name, array, dtype in (("frame", frame, self.in_dtype), ("out", out, self.out_dtype)):
-            if array.shape != self.shape or array.dtype != dtype:
-                raise InputError(
-                    f"{name} is {array.shape} {array.dtype}, this plan restores {self.shape} {dtype}: make a "
-                    "plan for it"
-                )
-        if slot not in self._filters:
-            raise InputError(f"slot {slot} holds no filter: call set_filter or set_filter_axes first")
+        self._require_array("out", out, self.out_dtype)
+        self._require_filter(slot)
+        self.transform(frame)
+        self._transformed = False  # the columns overwrite it
+        return self._finish(self._spectrum, out, slot)
+
+    def transform(self, frame: DeviceArray) -> None:
+        """Enqueue the first third alone, to `apply` several filters to one frame afterwards.
+
+        Raises
+        ------
+        InputError
+            Another shape or type.
+        """
+        self._require_array("frame", frame, self.in_dtype)
         self._rows_forward.set(0, frame)
-        self._columns.set(2, self._filters[slot])
-        self._rows_inverse.set(1, out)
         self._rows_forward()
-        self._columns()
-        self._rows_inverse()
-        return out
+        self._transformed = True
+
+    def apply(self, out: DeviceArray, slot: int = 0) -> DeviceArray:
+        """Enqueue the rest for the frame last transformed, which stays for another filter; returns `out`.
+
+        Raises
+        ------
+        InputError
+            Another shape or type, an empty slot, or no frame transformed.
+        """
+        self._require_array("out", out, self.out_dtype)
+        self._require_filter(slot)
+        if not self._transformed:
+            raise InputError("no frame has been transformed since the last restoration: call transform first")
+        if self._filtered is None:
+            self._filtered = self.device.empty(self._spectrum.shape, self._real)
+        return self._finish(self._filtered, out, slot)
 
     def restore(self, frame: NDArray[Any], slot: int = 0) -> NDArray[Any]:
         """Upload a frame, restore it, wait, and return the image.
@@ -545,6 +443,26 @@ class Restore:
 
     # ---- inside -------------------------------------------------------------------------------------------
 
+    def _finish(self, filtered: DeviceArray, out: DeviceArray, slot: int) -> DeviceArray:
+        self._columns.set(1, filtered)
+        self._columns.set(2, self._filters[slot])
+        self._rows_inverse.set(0, filtered)
+        self._rows_inverse.set(1, out)
+        self._columns()
+        self._rows_inverse()
+        return out
+
+    def _require_array(self, name: str, array: DeviceArray, dtype: np.dtype[Any]) -> None:
+        if array.shape != self.shape or array.dtype != dtype:
+            raise InputError(
+                f"{name} is {array.shape} {array.dtype}, this plan restores {self.shape} {dtype}: make a "
+                "plan for it"
+            )
+
+    def _require_filter(self, slot: int) -> None:
+        if slot not in self._filters:
+            raise InputError(f"slot {slot} holds no filter: call set_filter or set_filter_axes first")
+
     def _table(self, values: NDArray[np.float64]) -> DeviceArray:
         """Upload a table, never empty: a kernel's argument must name some memory."""
         return self.device.upload(np.append(values, 0.0).astype(self._real))
@@ -558,25 +476,9 @@ class Restore:
         return self._filters[slot]
 
 
-def padded_shape(shape: tuple[int, int], padding: int | tuple[int, int]) -> tuple[int, int]:
-    """Return the transform's (ny, nx) of a frame of `shape` with at least `padding` samples added.
-
-    Raises
-    ------
-    InputError
-        A negative padding, or one that makes an axis longer than 16384.
-    """
-    rows, columns = _checked_shape(shape)
-    pair = (padding, padding) if isinstance(padding, (int, np.integer)) else tuple(padding)
-    if len(pair) != 2 or any(p != int(p) or p < 0 for p in pair):
-        raise InputError(f"padding is {padding}: one whole number or (rows, columns), 0 or more, was wanted")
-    ny, nx = good_size(rows + int(pair[0])), good_size(columns + int(pair[1]))
-    if max(ny, nx) > LARGEST_PADDED_SIDE:
-        raise InputError(
-            f"padding is {padding}: the padded frame would be {ny} x {nx}, at most {LARGEST_PADDED_SIDE} a "
-            "side was wanted"
-        )
-    return ny, nx
+def _options(device: Device) -> list[str]:
+    """Return compiler options: a simulator knows less of LLVM than LLVM's optimiser writes."""
+    return ["-cl-opt-disable"] if device.facts.simulated else []
 
 
 def _io_defines(in_dtype: np.dtype[Any], out_dtype: np.dtype[Any]) -> dict[str, int | str]:
@@ -588,15 +490,6 @@ def _io_defines(in_dtype: np.dtype[Any], out_dtype: np.dtype[Any]) -> dict[str, 
         "OUT_BYTES": out_dtype.itemsize,
         "OUT_LIMIT": limit,
     }
-
-
-def _checked_shape(shape: tuple[int, int]) -> tuple[int, int]:
-    if len(shape) != 2 or not all(SMALLEST_SIDE <= side <= LARGEST_SIDE for side in shape):
-        raise InputError(
-            f"the frame's shape is {tuple(shape)}: (rows, columns) of {SMALLEST_SIDE} to {LARGEST_SIDE} each "
-            "were wanted"
-        )
-    return int(shape[0]), int(shape[1])
 
 
 def _checked_dtype(name: str, dtype: DTypeLike, real: np.dtype[Any]) -> np.dtype[Any]:
@@ -619,21 +512,7 @@ def _checked_axis(name: str, values: ArrayLike, length: int) -> NDArray[Any]:
     return axis
 
 
-def _checked_nsr(nsr: ArrayLike, shape: tuple[int, int] | None) -> NDArray[np.float64]:
-    values = np.asarray(nsr)
-    if values.dtype.kind not in "fiu" or (values.shape != () and values.shape != shape):
-        wanted = "a number" if shape is None else f"a number or {shape} numbers"
-        raise InputError(f"nsr is {values.shape} {values.dtype}: {wanted}, 0 or more, was wanted")
-    if not (np.isfinite(values).all() and (values >= 0).all()):
-        worst = float(values.ravel()[np.argmin(np.where(np.isfinite(values), values, -np.inf))])
-        raise InputError(f"nsr is {worst}: a finite noise-to-signal power of 0 or more was wanted")
-    return values.astype(np.float64)
-
-
 def _checked_slot(slot: int) -> int:
     if slot != int(slot) or slot < 0:
         raise InputError(f"slot is {slot}: a whole number from 0 on was wanted")
     return int(slot)
-
-
-__all__ = ["FAMILIES", "Launch", "Restore", "good_size", "padded_shape", "padding_weights"]

@@ -1,9 +1,8 @@
 // restore_butterflies.h : small forward transforms, in place, in natural order.
 //
-//   X[k] = sum_n x[n] exp(-2 pi i n k / R)              docs/maths.md, eq. W6
+//   X[k] = sum_n x[n] exp(-2 pi i n k / R)              docs/maths.md, eq. W5
 //
-//   xr, xi   R values each: real and imaginary parts; the type `vec` is a real or a vector of reals whose
-//            lanes are independent transforms. It must be defined before this file is included.
+//   xr, xi   R values each: real and imaginary parts, of one transform or of one in each lane
 //
 // The inverse (unscaled) of every one is itself with xr and xi exchanged.
 // R = 2, 3, 4, 5, 7, 8 and 9 are written out; 6, 10, 12 and 15 join coprime factors by index maps alone
@@ -12,10 +11,7 @@
 #ifndef ADOF_RESTORE_BUTTERFLIES_H
 #define ADOF_RESTORE_BUTTERFLIES_H
 
-#include "precision.h"
-
-// A plain `inline` helper becomes a call through memory on some compilers.
-#define RESTORE_INLINE static inline __attribute__((always_inline))
+#include "restore_vectors.h"
 
 RESTORE_INLINE void restore_radix2(vec *xr, vec *xi)
 {

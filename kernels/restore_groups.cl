@@ -1,6 +1,6 @@
 // restore_groups.cl : undo a known blur of a frame, for processors with many small cores.
 //
-//   restored = IFFT2( FFT2( padded frame ) * filter )    docs/maths.md, eqs W3 to W6
+//   restored = IFFT2( FFT2( padded frame ) * filter )    docs/maths.md, eqs. W2 to W5
 //
 // Three kernels: rows forward; columns forward, times filter, columns inverse; rows inverse. A work-group owns
 // two rows (one complex transform) or a block of BLOCK columns. The transforms run in place, decimated in
@@ -21,10 +21,6 @@
 //
 // Local memory: 2 NX reals for rows, 2 NY BLOCK reals for columns. One barrier after each pass.
 // Error: below 4e-7 (float) and 1e-15 (double), relative L2, 8 x 8 to 1024 x 1024, PoCL and Intel's runtime.
-
-#include "precision.h"
-
-typedef real vec;
 
 #include "restore_butterflies.h"
 
@@ -184,7 +180,8 @@ RESTORE_INLINE void restore_put(__global OUT_TYPE *image, const int row, const i
 }
 
 // Work-group g transforms rows 2 g and 2 g + 1 as the real and imaginary parts of one.
-__kernel __attribute__((reqd_work_group_size(ROW_ITEMS, 1, 1))) void restore_rows_forward(
+__kernel void __attribute__((reqd_work_group_size(ROW_ITEMS, 1, 1)))
+restore_rows_forward(
     __global const IN_TYPE *restrict frame,
     __global real          *restrict spectrum,
     __global const int     *restrict position,
@@ -213,7 +210,8 @@ __kernel __attribute__((reqd_work_group_size(ROW_ITEMS, 1, 1))) void restore_row
 }
 
 // Work-group g carries column block g there and back; the rows of the padding are made here, from two others.
-__kernel __attribute__((reqd_work_group_size(COLUMN_ITEMS, 1, 1))) void restore_columns(
+__kernel void __attribute__((reqd_work_group_size(COLUMN_ITEMS, 1, 1)))
+restore_columns(
     __global const real *spectrum,
     __global real       *filtered,              // may be the spectrum itself
     __global const real *restrict filter,
@@ -253,7 +251,8 @@ __kernel __attribute__((reqd_work_group_size(COLUMN_ITEMS, 1, 1))) void restore_
 }
 
 // Work-group g puts rows 2 g and 2 g + 1 together again.
-__kernel __attribute__((reqd_work_group_size(ROW_ITEMS, 1, 1))) void restore_rows_inverse(
+__kernel void __attribute__((reqd_work_group_size(ROW_ITEMS, 1, 1)))
+restore_rows_inverse(
     __global const real *restrict filtered,
     __global OUT_TYPE   *restrict image,
     __global const int  *restrict position,

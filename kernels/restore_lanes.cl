@@ -1,6 +1,6 @@
 // restore_lanes.cl : undo a known blur of a frame, for processors with wide SIMD and few cores.
 //
-//   restored = IFFT2( FFT2( padded frame ) * filter )    docs/maths.md, eqs W3 to W6
+//   restored = IFFT2( FFT2( padded frame ) * filter )    docs/maths.md, eqs. W2 to W5
 //
 // Three kernels, no barriers: rows forward; columns forward, times filter, columns inverse; rows inverse. A
 // work-item owns LANES * 2 rows or LANES columns, one to each SIMD lane. The transforms run in place,
@@ -15,6 +15,9 @@
 //   row_blend (NX - COLS) real, column_blend (NY - ROWS) real   share of the near edge in the padding
 //   row_turns, column_turns   real              twiddle factors, pass by pass: cos and -sin, q = 1 .. R - 1
 //
+// A work-item's samples lie real, imaginary, real, .. : apart, the strides of a power of two would fill the
+// same cache sets twice over.
+//
 // Defines: ROWS, COLS frame; NX, NY padded; HELD rows kept in the spectrum; BLOCKS column blocks; IN_TYPE,
 // OUT_TYPE; OUT_LIMIT the largest code of an integer output, 0 for a real one. The passes come from the
 // generated lists ROW_PASSES, ROW_PASSES_BACK, COLUMN_PASSES, COLUMN_PASSES_BACK, COLUMN_LAST.
@@ -22,26 +25,13 @@
 // Local size 1; no local memory. Private memory: two vectors of 64 bytes for each sample of a row or column.
 // Error: below 4e-7 (float) and 1e-15 (double), relative L2, 8 x 8 to 1024 x 1024, PoCL and Intel's runtime.
 
-#include "precision.h"
+#define RESTORE_LANES 1
 
-#ifndef RESTORE_PORTABLE
-#define RESTORE_PORTABLE 0        // 1: only what OpenCL C 1.2 itself offers
-#endif
+#include "restore_transpose.h"
+#include "restore_butterflies.h"
 
 #define RESTORE_JOIN_(A, B) A##B
 #define RESTORE_JOIN(A, B)  RESTORE_JOIN_(A, B)
-
-#if REAL_IS_DOUBLE
-#define LANES 8
-#define SCALAR double
-typedef double8 vec;
-typedef long8   whole;
-#else
-#define LANES 16
-#define SCALAR float
-typedef float16 vec;
-typedef int16   whole;
-#endif
 
 // Rows of a frame start anywhere: these promise no more than their element's alignment.
 typedef RESTORE_JOIN(IN_TYPE, LANES)  in_vec  __attribute__((aligned(IN_BYTES)));
@@ -66,11 +56,6 @@ typedef RESTORE_JOIN(OUT_TYPE, LANES) out_vec __attribute__((aligned(OUT_BYTES))
 #ifndef RESTORE_WIDE
 #define RESTORE_WIDE
 #endif
-
-#define RESTORE_KERNEL __kernel RESTORE_WIDE __attribute__((reqd_work_group_size(1, 1, 1))) void
-
-#include "restore_butterflies.h"
-#include "restore_transpose.h"
 
 // One pass forward over LENGTH values in runs of R * M: butterfly, then turn by exp(-2 pi i j q / (R M)).
 // And one pass back: turn the other way, then the inverse butterfly.
@@ -242,7 +227,8 @@ RESTORE_INLINE void restore_store(const vec *v, __global OUT_TYPE *image, const 
 }
 
 // Work-item b transforms rows 2 b LANES onward: the first LANES as real parts, the next as imaginary parts.
-RESTORE_KERNEL restore_rows_forward(
+__kernel RESTORE_WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
+restore_rows_forward(
     __global const IN_TYPE *restrict frame,
     __global vec           *restrict spectrum,
     __global const int     *restrict position,
@@ -280,7 +266,8 @@ RESTORE_KERNEL restore_rows_forward(
 }
 
 // Work-item b carries column block b there and back; the rows of the padding are made here, from two others.
-RESTORE_KERNEL restore_columns(
+__kernel RESTORE_WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
+restore_columns(
     __global const vec  *spectrum,
     __global vec        *filtered,              // may be the spectrum itself
     __global const vec  *restrict filter,
@@ -312,7 +299,8 @@ RESTORE_KERNEL restore_columns(
 }
 
 // Work-item b puts rows 2 b LANES onward together again: the same pairs, the same order, backwards.
-RESTORE_KERNEL restore_rows_inverse(
+__kernel RESTORE_WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
+restore_rows_inverse(
     __global const vec  *restrict filtered,
     __global OUT_TYPE   *restrict image,
     __global const int  *restrict position,

@@ -9,10 +9,17 @@
 #ifndef ADOF_RESTORE_TRANSPOSE_H
 #define ADOF_RESTORE_TRANSPOSE_H
 
-#include "precision.h"
+#ifndef RESTORE_LANES
+#define RESTORE_LANES 1
+#endif
+#ifndef RESTORE_PORTABLE
+#define RESTORE_PORTABLE 0        // 1: only what OpenCL C 1.2 itself offers
+#endif
+
+#include "restore_vectors.h"
 
 #ifdef __has_builtin
-#if __has_builtin(__builtin_shufflevector) && !RESTORE_PORTABLE
+#if __has_builtin(__builtin_shufflevector) && LANES > 1 && !RESTORE_PORTABLE
 #define RESTORE_SHUFFLES 1
 #endif
 #endif

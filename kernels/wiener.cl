@@ -1,6 +1,6 @@
 // wiener.cl : the filter that undoes a known blur as far as noise allows.
 //
-//   G = conj(H) / (|H|^2 + nsr), and 0 where H = 0       docs/maths.md, eqs W1, W2
+//   G = conj(H) / (|H|^2 + nsr), and 0 where H = 0       docs/maths.md, eq. W1
 //
 //   h_rows    (.., NY) cplx           1-D OTF along y, DC first; entry `row_entry` of a table
 //   h_cols    (.., NX) cplx           1-D OTF along x, DC first; entry `col_entry` of a table

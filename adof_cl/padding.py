@@ -1,0 +1,90 @@
+"""How a frame is continued beyond its edges, so that a periodic transform does it no harm."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adof_cl.errors import InputError
+
+SMALLEST_SIDE = 8
+LARGEST_SIDE = 4096
+LARGEST_PADDED_SIDE = 16384
+
+
+def good_size(at_least: int) -> int:
+    """Return the smallest length from `at_least` on whose prime factors are 2, 3, 5 and 7."""
+    n = max(1, at_least)
+    while True:
+        rest = n
+        for prime in (2, 3, 5, 7):
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1:
+            return n
+        n += 1
+
+
+def checked_frame_shape(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Refuse anything but two sides of 8 to 4096."""
+    if len(shape) != 2 or not all(SMALLEST_SIDE <= side <= LARGEST_SIDE for side in shape):
+        raise InputError(
+            f"the frame's shape is {tuple(shape)}: (rows, columns) of {SMALLEST_SIDE} to {LARGEST_SIDE} each "
+            "were wanted"
+        )
+    return int(shape[0]), int(shape[1])
+
+
+def padded_shape(shape: tuple[int, int], padding: int | tuple[int, int]) -> tuple[int, int]:
+    """Return the transform's (ny, nx) of a frame of `shape` with at least `padding` samples added.
+
+    Raises
+    ------
+    InputError
+        A frame beyond the limits, a negative padding, or one that makes an axis longer than 16384.
+    """
+    rows, columns = checked_frame_shape(shape)
+    pair = (padding, padding) if isinstance(padding, (int, np.integer)) else tuple(padding)
+    if len(pair) != 2 or any(p != int(p) or p < 0 for p in pair):
+        raise InputError(f"padding is {padding}: one whole number or (rows, columns), 0 or more, was wanted")
+    ny, nx = good_size(rows + int(pair[0])), good_size(columns + int(pair[1]))
+    if max(ny, nx) > LARGEST_PADDED_SIDE:
+        raise InputError(
+            f"padding is {padding}: the padded frame would be {ny} x {nx}, at most {LARGEST_PADDED_SIDE} a "
+            "side was wanted"
+        )
+    return ny, nx
+
+
+def padding_weights(samples: int, taper: bool) -> NDArray[np.float64]:
+    """Return the share of the near edge in each sample of the padding.
+
+    The padding lies behind the far edge and, the transform being periodic, before the near one: it starts as
+    a copy of the far edge (0) and ends as a copy of the near edge (1), by a raised cosine or by a step.
+
+    Source
+    ------
+    docs/maths.md, eq. W4.
+    """
+    t = np.arange(samples)
+    if taper:
+        return np.asarray(np.sin(np.pi / 2 * (t + 1) / (samples + 1)) ** 2, dtype=np.float64)
+    return (t >= samples - samples // 2).astype(np.float64)
+
+
+def padded_frame(frame: NDArray[Any], padded: tuple[int, int], *, taper: bool = True) -> NDArray[np.float64]:
+    """Return the frame at [0, 0] of a larger array, continued as `padding_weights` says, on the host.
+
+    Source
+    ------
+    docs/maths.md, eq. W3.
+    """
+    image = np.asarray(frame, dtype=np.float64)
+    for axis in (0, 1):
+        w = padding_weights(padded[axis] - image.shape[axis], taper)
+        near, far = np.take(image, [0], axis), np.take(image, [-1], axis)
+        w = w[:, None] if axis == 0 else w[None, :]
+        image = np.concatenate([image, (1 - w) * far + w * near], axis=axis)
+    return image

@@ -1,0 +1,210 @@
+"""Wiener filters formed on the device, for separable and for measured blurs (kernels/wiener.cl)."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.fft
+from numpy.typing import ArrayLike, NDArray
+
+from adof_cl.device import Device, DeviceArray
+from adof_cl.errors import InputError
+from adof_cl.noise import checked_nsr
+from adof_cl.program import Program
+
+
+class WienerFilter:
+    """Form restoration filters for one padded size: what `rfft2` of a padded frame is multiplied by.
+
+    Built once: compiles and allocates. Every method enqueues one kernel and does not wait.
+
+    Parameters
+    ----------
+    device
+        The opened device.
+    shape
+        Padded frame, (ny, nx).
+    precision
+        "float32" or "float64".
+
+    Raises
+    ------
+    InputError
+        A side below 2.
+    DeviceError
+        float64 on a device without it.
+
+    Source
+    ------
+    Paper eq. (3) as corrected in docs/maths.md, eq. W1.
+    """
+
+    def __init__(self, device: Device, shape: tuple[int, int], *, precision: str = "float32") -> None:
+        if len(shape) != 2 or min(shape) < 2:
+            raise InputError(f"the padded shape is {tuple(shape)}: two sides of 2 or more were wanted")
+        self.device = device
+        self.shape = ny, nx = int(shape[0]), int(shape[1])
+        self.filter_shape = half = (ny, nx // 2 + 1)
+        self._real = device.real_type(precision)
+        self._complex = np.dtype(np.result_type(self._real, np.complex64))
+        program = Program(
+            device,
+            "wiener.cl",
+            {"REAL_IS_DOUBLE": self._real == np.float64},
+            options=["-cl-opt-disable"] if device.facts.simulated else [],
+        )
+        self._h_rows = device.empty((ny,), self._complex)
+        self._h_cols = device.empty((nx,), self._complex)
+        self._otf = device.empty(half, self._complex)
+        self._noise = device.empty(half, self._real)
+        order = device.upload(np.arange(ny, dtype=np.int32))
+        i32, one, zero = np.int32, self._real.type(1), self._real.type(0)
+        self._axes = program.launch(
+            "wiener_axes", (half[1], ny), None,
+            self._h_rows, self._h_cols, None, order, None, i32(ny), i32(nx), i32(0), i32(0), zero, one,
+        )  # fmt: skip
+        self._spectrum = program.launch(
+            "wiener_spectrum", (half[1], ny), None,
+            self._otf, None, order, None, i32(ny), i32(nx), zero, one,
+        )  # fmt: skip
+
+    def from_otf_axes(
+        self, h_rows: ArrayLike, h_cols: ArrayLike, nsr: ArrayLike, *, out: DeviceArray | None = None
+    ) -> DeviceArray:
+        """Form the filter of a separable blur, H[j, i] = h_rows[j] h_cols[i].
+
+        Parameters
+        ----------
+        h_rows, h_cols
+            (ny,) and (nx,) complex, DC first; the Nyquist bin of an even axis is made real.
+        nsr
+            Noise to signal power, 0 or more: a number, or (ny, nx // 2 + 1).
+        out
+            (ny, nx // 2 + 1) complex, else a new array.
+
+        Raises
+        ------
+        InputError
+            Wrong shape, not finite, or negative.
+        """
+        axes = []
+        for name, values, length in (("h_rows", h_rows, self.shape[0]), ("h_cols", h_cols, self.shape[1])):
+            axis = np.asarray(values)
+            if axis.shape != (length,) or not np.isfinite(axis).all():
+                raise InputError(
+                    f"{name} is {axis.shape} {axis.dtype}: ({length},) finite numbers were wanted"
+                )
+            axes.append(axis.astype(self._complex))
+        level, noise = self._checked_noise(nsr)
+        out = self._checked_out(out)
+        self._h_rows.upload(axes[0])
+        self._h_cols.upload(axes[1])
+        self._axes.set(2, noise)
+        self._axes.set(4, out)
+        self._axes.set(9, level)
+        self._axes()
+        return out
+
+    def from_otf(self, otf: ArrayLike, nsr: ArrayLike, *, out: DeviceArray | None = None) -> DeviceArray:
+        """Form the filter of any blur from the half of its OTF, (ny, nx // 2 + 1) complex, DC at [0, 0].
+
+        Raises
+        ------
+        InputError
+            Wrong shape, not finite, or negative nsr.
+        """
+        spectrum = np.asarray(otf)
+        if spectrum.shape != self.filter_shape or not np.isfinite(spectrum).all():
+            raise InputError(
+                f"otf is {spectrum.shape} {spectrum.dtype}: {self.filter_shape} finite numbers were wanted"
+            )
+        level, noise = self._checked_noise(nsr)
+        out = self._checked_out(out)
+        self._otf.upload(spectrum.astype(self._complex))
+        self._spectrum.set(1, noise)
+        self._spectrum.set(3, out)
+        self._spectrum.set(6, level)
+        self._spectrum()
+        return out
+
+    def from_psf(
+        self,
+        psf: NDArray[np.generic],
+        nsr: ArrayLike,
+        *,
+        centre_yx: tuple[int, int] | None = None,
+        out: DeviceArray | None = None,
+    ) -> DeviceArray:
+        """Form the filter of a measured blur; see `psf_otf` for `psf` and `centre_yx`.
+
+        Raises
+        ------
+        InputError
+            A PSF that cannot be one, or negative nsr.
+        """
+        return self.from_otf(psf_otf(psf, self.shape, centre_yx=centre_yx), nsr, out=out)
+
+    def _checked_noise(self, nsr: ArrayLike) -> tuple[np.generic, DeviceArray | None]:
+        values = checked_nsr(nsr, self.filter_shape)
+        if values.ndim == 0:
+            return self._real.type(values), None
+        return self._real.type(0), self._noise.upload(values.astype(self._real))
+
+    def _checked_out(self, out: DeviceArray | None) -> DeviceArray:
+        if out is None:
+            return self.device.empty(self.filter_shape, self._complex)
+        if out.shape != self.filter_shape or out.dtype != self._complex:
+            raise InputError(
+                f"out is {out.shape} {out.dtype}, {self.filter_shape} {self._complex} was wanted: allocate "
+                "it for the half spectrum"
+            )
+        return out
+
+
+def psf_otf(
+    psf: NDArray[np.generic], shape: tuple[int, int], *, centre_yx: tuple[int, int] | None = None
+) -> NDArray[np.complex128]:
+    """Transform a measured point-spread function to the OTF of a padded frame, in float64.
+
+    Parameters
+    ----------
+    psf
+        (rows, columns), any size up to `shape`, any scale: it is normalised to unit sum.
+    shape
+        Padded frame, (ny, nx).
+    centre_yx
+        The pixel a point stays at, (n // 2, m // 2) by default.
+
+    Returns
+    -------
+    NDArray[np.complex128]
+        (ny, nx // 2 + 1), DC at [0, 0] and equal to 1.
+
+    Raises
+    ------
+    InputError
+        Not two-dimensional, larger than the frame, not finite, or a sum of 0 or less.
+
+    Source
+    ------
+    docs/maths.md, eq. W6.
+    """
+    values = np.asarray(psf)
+    if values.ndim != 2 or values.size == 0 or values.dtype.kind not in "fiu":
+        raise InputError(f"the PSF is {values.shape} {values.dtype}: a real (rows, columns) was wanted")
+    if values.shape[0] > shape[0] or values.shape[1] > shape[1]:
+        raise InputError(
+            f"the PSF is {values.shape[0]} x {values.shape[1]}, the frame with its padding only {shape[0]} x "
+            f"{shape[1]}: crop the PSF or pad more"
+        )
+    if not np.isfinite(values).all():
+        raise InputError("the PSF holds NaN or infinity: finite numbers were wanted")
+    grid = values.astype(np.float64)
+    total = float(grid.sum())
+    if total <= 0:
+        raise InputError(f"the PSF sums to {total:g}: a sum above 0 was wanted")
+    centre = centre_yx or (values.shape[0] // 2, values.shape[1] // 2)
+    if any(not 0 <= c < side for c, side in zip(centre, values.shape, strict=True)):
+        raise InputError(f"the PSF's centre is {centre}: a pixel of its {values.shape} was wanted")
+    padded = np.zeros(shape)
+    padded[: values.shape[0], : values.shape[1]] = grid / total
+    return np.asarray(scipy.fft.rfft2(np.roll(padded, (-centre[0], -centre[1]), (0, 1))))
