@@ -295,8 +295,8 @@ def depth_to_cover_um(near_um: float, far_um: float, optics: OpticalSystem, *, j
         return optics.depth_um(reach)
     except InputError as refusal:
         raise LimitError(
-            f"depths from {near_um:g} to {far_um:g} um defocus by {reach:.0f} rad, more than any depth beyond "
-            "the focus: choose a shallower range"
+            f"depths from {near_um:g} to {far_um:g} um defocus by {reach:.0f} rad, more than any depth "
+            "beyond the focus: choose a shallower range"
         ) from refusal
 
 

@@ -36,6 +36,8 @@ class PupilPhase:
     """
 
     def __init__(self, device: Device, rows: int, columns: int, *, precision: str = "float32") -> None:
+        if min(rows, columns) < 1:
+            raise InputError(f"{rows} x {columns} pupil samples came: at least 1 x 1 was wanted")
         self._device = device
         self._real = device.real_type(precision)
         self._shape = (rows, columns)

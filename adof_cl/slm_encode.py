@@ -204,7 +204,7 @@ class SlmEncode:
     def __call__(self, mask: Mask, *, tilt_xy_rad: tuple[float, float] = (0.0, 0.0)) -> DeviceArray:
         """Enqueue the codes of `mask`; return `self.out`, (rows, columns) uint8.
 
-        A tilt of 2 pi k radians at the stop's edge moves the image by k lambda N.
+        A tilt of pi radians at the stop's edge moves the image by -lambda N along that axis.
 
         Raises
         ------

@@ -55,7 +55,7 @@ static inline cplx otf_end(const real turns, const real k)
 
 static inline cplx otf_value(const two_term w, const two_term alpha, const two_term psi, const two_term shift)
 {
-    const two_term b = two_term_add((two_term)(1, 0), two_term_scale(w, (real)-0.5));
+    const two_term b = two_term_add((two_term)(1, 0), two_term_scale(w, -REAL_C(0.5)));
     if (b.x <= 0) return (cplx)(0);
 
     // Everything in turns; c = 6 pi aw, q = 2 pi pw.
@@ -64,7 +64,7 @@ static inline cplx otf_value(const two_term w, const two_term alpha, const two_t
     const two_term cb = two_term_mul(two_term_add(two_term_scale(aw, 2), aw), b);
     const two_term high = two_term_add(pw, cb);
     const two_term low = two_term_add(pw, -cb);
-    const real phase_w = two_term_fraction(two_term_scale(two_term_mul(aw, two_term_mul(w, w)), (real)0.25));
+    const real phase_w = two_term_fraction(two_term_scale(two_term_mul(aw, two_term_mul(w, w)), REAL_C(0.25)));
     const two_term even = two_term_mul(cb, b);
     const two_term odd = two_term_scale(two_term_mul(pw, b), 2);
 
@@ -82,9 +82,9 @@ static inline cplx otf_value(const two_term w, const two_term alpha, const two_t
     const real half_run = two_term_fraction(odd);
     const cplx far = cplx_mul(turns_cis(middle + half_run), otf_end(high.x, k));
     const cplx near = cplx_mul(turns_cis(middle - half_run), otf_end(fabs(low.x), k));
-    if (low.x >= 0) return (real)0.5 * (near - far);
+    if (low.x >= 0) return REAL_C(0.5) * (near - far);
     const cplx stationary = cplx_mul((cplx)(1, 1), turns_cis(phase_w - two_term_fraction(two_term_mul(shift, w))));
-    return (real)0.5 * (stationary / k - near - far);
+    return REAL_C(0.5) * (stationary / k - near - far);
 }
 
 __kernel void otf_1d(

@@ -53,5 +53,5 @@ __kernel void slm_encode(
     }
     real f = x_turns[column] + y_turns[row];
     if (has_correction) f += correction[i];
-    codes[i] = table[(int)(256 * turns_wrap(f) + (real)0.5) & 255];
+    codes[i] = table[(int)(256 * turns_wrap(f) + REAL_C(0.5)) & 255];
 }

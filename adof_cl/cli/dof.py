@@ -138,7 +138,8 @@ def _print(report: dict[str, Any], plot: Path | None) -> None:
         console.print(
             f"{chosen['calibration']:>5}{', focus moved' if chosen['joint'] else ''}: alpha "
             f"{chosen['alpha']:.2f}, focus {chosen['focus_psi']:.2f} rad ({chosen['focus_um']:.0f} um)"
-            f"{'' if chosen['covered'] else ', the strongest it knows: the range is deeper than it covers'}"
+            f"{'' if chosen['covered'] else ', the strongest it knows: the range is deeper than it covers'}",
+            soft_wrap=True,
         )
     if plot is not None:
         console.print(f"{plot}")

@@ -52,7 +52,7 @@ def otf(
     table = Table(box=None, header_style="bold")
     for heading in ("u", "Re H", "Im H", "|H|"):
         table.add_column(heading, justify="right")
-    digits = 16 if chosen == "float64" else 8
+    digits = 13 if chosen == "float64" else 7
     for at, value in zip(u, values, strict=True):
         table.add_row(
             f"{at:g}", *(f"{part:.{digits}f}" for part in (value.real, value.imag, abs(complex(value))))
