@@ -186,7 +186,80 @@ def psf_of_axes(otf_y: NDArray[np.complex128], otf_x: NDArray[np.complex128]) ->
 
 # ---- wiener -----------------------------------------------------------------------------------------------
 
+
+def wiener(otf: ArrayLike, nsr: ArrayLike) -> NDArray[np.complex128]:
+    """Return the filter conj(H) / (|H|^2 + nsr), and 0 where H = 0.
+
+    Source
+    ------
+    The paper's Eq. 3 as corrected in docs/maths.md, eq. W1.
+    """
+    h = np.asarray(otf, dtype=np.complex128)
+    power = np.abs(h) ** 2 + np.asarray(nsr, dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(h == 0, 0, h.conj() / power)
+
+
+def wiener_of_axes(h_rows: ArrayLike, h_cols: ArrayLike, nsr: ArrayLike) -> NDArray[np.complex128]:
+    """Return the filter of a separable blur over the half spectrum, (ny, nx // 2 + 1).
+
+    The Nyquist bin of an even axis is replaced by its real part.
+
+    Source
+    ------
+    docs/maths.md, eq. W1.
+    """
+    v, u = np.array(h_rows, dtype=np.complex128), np.array(h_cols, dtype=np.complex128)
+    for axis in (v, u):
+        if axis.size % 2 == 0:
+            axis[axis.size // 2] = axis[axis.size // 2].real
+    return wiener(np.outer(v, u[: u.size // 2 + 1]), nsr)
+
+
 # ---- restore ----------------------------------------------------------------------------------------------
+
+
+def restore_padding(
+    frame: NDArray[np.generic], padded: tuple[int, int], *, taper: bool = True
+) -> NDArray[np.float64]:
+    """Continue a frame to (ny, nx): the frame at [0, 0], then from its far edge to its near one.
+
+    Source
+    ------
+    docs/maths.md, eqs. W3 and W4.
+    """
+    image = np.asarray(frame, dtype=np.float64)
+    for axis in (0, 1):
+        samples = padded[axis] - image.shape[axis]
+        after = [(0, samples if i == axis else 0) for i in (0, 1)]
+        before = [(samples if i == axis else 0, 0) for i in (0, 1)]
+        far = np.pad(image, after, mode="edge")
+        near = np.roll(np.pad(image, before, mode="edge"), -samples, axis)
+        t = np.arange(1, samples + 1) / (samples + 1)
+        step = np.arange(samples) >= -(-samples // 2)
+        share = np.sin(np.pi / 2 * t) ** 2 if taper else step.astype(np.float64)
+        w = np.append(np.zeros(image.shape[axis]), share)
+        w = w[:, None] if axis == 0 else w[None, :]
+        image = (1 - w) * far + w * near
+    return image
+
+
+def restore(
+    frame: NDArray[np.generic],
+    gain: NDArray[np.complexfloating],
+    padded: tuple[int, int],
+    *,
+    taper: bool = True,
+) -> NDArray[np.float64]:
+    """Filter a frame by `gain`, (ny, nx // 2 + 1), and crop: not rounded, not clamped.
+
+    Source
+    ------
+    docs/maths.md, eq. W2.
+    """
+    spectrum = np.fft.rfft2(restore_padding(frame, padded, taper=taper)) * gain
+    return np.asarray(np.fft.irfft2(spectrum, s=padded)[: frame.shape[0], : frame.shape[1]])
+
 
 # ---- image_prep -------------------------------------------------------------------------------------------
 
