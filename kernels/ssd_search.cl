@@ -26,7 +26,8 @@
 // ssd_search_best: one work-item (lanes) or one work-group (groups) a template.
 //
 // Error: uchar ssd exact. Float ssd below (TEMPLATE_ROWS + TEMPLATE_COLUMNS + 2) / 2 eps relative, for it sums row by
-// row. gain_offset: uchar sums exact, then 8 eps absolute; else 4 (rows + columns) eps absolute at equal contrast.
+// row. gain_offset: uchar sums exact, then (8 + 4 TAPS/s) eps absolute, s the root of both centred sums of squares;
+// else (2 (rows + columns) + 4 span + 12) eps absolute, span the window's range in standard deviations of the place.
 
 #ifndef IMAGE_KIND
 #define IMAGE_KIND 0          // 0 uchar, 1 ushort, 2 float
@@ -153,6 +154,17 @@ static inline __attribute__((always_inline)) integers gain_offset_bits(
     const reals residual = 1.0f - (covariance / image_variance) * (covariance / template_variance);
     const reals score = residual > 0.0f ? residual : (reals)0.0f;
     return AS_INTEGERS(((covariance > 0.0f) & (image_variance > 0.0f)) ? score : (reals)1.0f);
+}
+#endif
+
+#if GAIN_OFFSET && IMAGE_KIND != 0
+// A grey level of the window, so that means taken from it lose nothing; the same for all tiles of a window.
+static inline float window_level(__global const pixel *image, __global const int *origin, const int image_columns,
+                                 const int offset_rows, const int offset_columns)
+{
+    const int row = origin[0] + (offset_rows + TEMPLATE_ROWS - 1) / 2;
+    const float middle = (float)image[row * image_columns + origin[1] + (offset_columns + TEMPLATE_COLUMNS - 1) / 2];
+    return middle - middle == 0.0f ? middle : 0.0f;   // not NaN, not infinite
 }
 #endif
 
@@ -324,9 +336,7 @@ void ssd_search(
 #if IMAGE_KIND == 0
     const float level = 128.0f;
 #elif GAIN_OFFSET
-    // Near the window's grey level, so that the means below lose nothing; the same for all tiles of a window.
-    const float level = (float)image[(origins[2 * index] + (offset_rows + TEMPLATE_ROWS - 1) / 2) * image_columns
-                                     + origins[2 * index + 1] + (offset_columns + TEMPLATE_COLUMNS - 1) / 2];
+    const float level = window_level(image, origins + 2 * index, image_columns, offset_rows, offset_columns);
 #else
     const float level = 0.0f;
 #endif
@@ -485,8 +495,7 @@ void ssd_search(
 #if IMAGE_KIND == 0
     const number level = 128;
 #elif GAIN_OFFSET
-    const number level = (float)image[(origins[2 * index] + (offset_rows + TEMPLATE_ROWS - 1) / 2) * image_columns
-                                      + origins[2 * index + 1] + (offset_columns + TEMPLATE_COLUMNS - 1) / 2];
+    const number level = window_level(image, origins + 2 * index, image_columns, offset_rows, offset_columns);
 #else
     const number level = 0.0f;
 #endif
