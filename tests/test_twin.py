@@ -14,7 +14,7 @@ from adof_cl import reference, twin
 from adof_cl.errors import InputError
 from adof_cl.optics import Mask, OpticalSystem
 from adof_cl.twin import parts
-from adof_cl.twin.pupil import Pupil
+from adof_cl.twin.pupil import Pupil, read_codes
 from adof_cl.twin.render import Layer
 
 Image = NDArray[np.float64]
@@ -123,6 +123,18 @@ def test_with_no_misalignment_the_cameras_are_as_drawn() -> None:
         np.testing.assert_array_equal(drawn[1], true[1])
     tilt, pitch = rig.design.tilt_rad, rig.design.optics_2.object_pitch_um
     np.testing.assert_allclose(drawn[0] * pitch, [[math.cos(tilt), 0, math.sin(tilt)], [0, 1, 0]], atol=1e-15)
+
+
+def test_each_cameras_defocus_is_that_of_the_depth_along_its_own_axis() -> None:
+    rig = twin.build(11)
+    for camera, optics in ((1, rig.design.optics_1), (2, rig.design.optics_2)):
+        across, down = rig.world.projection(camera)[0]
+        axis = np.cross(across, down)
+        axis /= np.linalg.norm(axis)
+        for part, pose in (("hole", rig.world.hole_pose()), ("peg", rig.world.peg_pose())):
+            assert rig.world.psi_rad(camera, part) == pytest.approx(
+                optics.psi_rad(axis @ pose.xyz_um), abs=1e-9
+            )
 
 
 def test_a_drawn_rig_differs_from_its_drawing_by_no_more_than_half_a_degree_and_half_a_percent() -> None:
@@ -264,6 +276,22 @@ def test_no_mask_and_no_defocus_change_the_light_in_all() -> None:
         assert blurred == pytest.approx(plain, rel=1e-5)
 
 
+def test_what_the_panels_steps_send_aside_lands_in_its_first_orders() -> None:
+    psi = 120.0
+    pupil = read_codes(codes(Mask(0.0, -psi)), twin.Design().panel, OPTICS.aperture_um)
+    centre = np.array([300.0, 200.0])
+    planes, first = Layer(OPTICS).image(box_part(60.0, 60.0), np.eye(2) / 7.4, centre, pupil, psi)
+    across = planes[0].sum(axis=0)
+    order_px = OPTICS.wavelength_um * OPTICS.f_number * OPTICS.aperture_um / (32.0 * 7.4)
+    off = np.abs(first[1] + np.arange(across.size) - centre[0])
+    near_orders = np.abs(off - order_px) < order_px / 2
+    # Light of the second orders, and tails, lie elsewhere.
+    assert across[near_orders].sum() / across.sum() == pytest.approx(pupil.along_x.order_leak, rel=0.2)
+    assert across[off < order_px / 2].sum() / across.sum() == pytest.approx(
+        1 - pupil.along_x.order_leak, rel=0.02
+    )
+
+
 @pytest.mark.parametrize(("depth_um", "alpha_rad"), [(4000.0, 100.0), (3000.0, 80.0)])
 @pytest.mark.parametrize("slm_pixels", [False, True])
 def test_a_deep_coded_hole_is_displaced_as_predicted_and_its_own_filter_brings_it_back(
@@ -376,6 +404,19 @@ def test_the_same_seed_gives_the_same_frames_and_another_seed_others() -> None:
     for a, b, c in zip(one, again, other, strict=True):
         np.testing.assert_array_equal(a, b)
         assert (a != c).any()
+
+
+def test_noise_differs_between_seeds_cameras_and_exposures() -> None:
+    fields = []
+    for seed in (7, 8):
+        rig = twin.build(seed)
+        corner = ((0, 0), (120, 60))  # background alone
+        for camera in (rig.camera_1, rig.camera_2):
+            camera.set_region(*corner)
+            fields += [camera.grab().pixels.astype(np.float64) for _ in range(2)]
+    correlation = np.corrcoef(np.stack(fields).reshape(len(fields), -1)) - np.eye(len(fields))
+    # Six standard errors of a correlation over 7200 pixels.
+    assert np.abs(correlation).max() < 6 / math.sqrt(7200)
 
 
 # ---- touching ---------------------------------------------------------------------------------------------

@@ -282,15 +282,15 @@ def test_a_frame_taken_while_the_panel_settles_is_a_mixture_and_the_truth_says_s
     assert rig.slm.settled
     rig.slm.show(codes(Mask(60.0)))
     assert not rig.slm.settled
-    middle_s = 0.1 + rig.slm.settling_s / 2
-    half = rig.world.radiance(1, middle_s, middle_s, (0, 0), shape)
-    assert rig.world.truth(middle_s).mask_in_transition
+    early_s = 0.1 + rig.slm.settling_s / 4
+    mixed = rig.world.radiance(1, early_s, early_s, (0, 0), shape)
+    assert rig.world.truth(early_s).mask_in_transition
     rig.clock.wait(rig.slm.settling_s)
     assert rig.slm.settled
     now_s = rig.clock.now_s
     assert not rig.world.truth().mask_in_transition
     new = rig.world.radiance(1, now_s, now_s, (0, 0), shape)
-    np.testing.assert_allclose(half, (old + new) / 2, atol=1e-5)
+    np.testing.assert_allclose(mixed, 0.75 * old + 0.25 * new, atol=1e-5)
     assert np.abs(new - old).max() > 0.05
     assert not rig.world.truth(0.05).mask_in_transition
 
