@@ -234,7 +234,8 @@ class Psf:
             for n in codes.shape
         ]
         turns = self._device.empty((self.samples, self.samples), self._real)
-        self._program.launch(
+        # Kept until the next call: a device may still be at work on it when this returns.
+        self._panel = self._program.launch(
             "psf_panel",
             (self.samples, self.samples),
             None,
@@ -245,7 +246,8 @@ class Psf:
             np.int32(self.samples),
             np.int32(panel.columns),
             self._real.type(panel.stroke_rad / (2 * math.pi) / 255),
-        )()
+        )
+        self._panel()
         return turns
 
     def camera_otf(self, optics: OpticalSystem, shape: tuple[int, int]) -> NDArray[np.complex128]:

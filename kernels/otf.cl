@@ -101,7 +101,8 @@ __kernel void otf_1d(
     if (i >= n) return;
 
     const two_term v = u[i];
-    cplx h = otf_value(v.x < 0 ? -v : v, (two_term)(alpha_hi, alpha_lo), (two_term)(psi_hi, psi_lo),
+    const real side = v.x < 0 ? -1 : 1;
+    cplx h = otf_value(side * v, (two_term)(alpha_hi, alpha_lo), (two_term)(psi_hi, psi_lo),
                        (two_term)(shift_hi, shift_lo));
     if (v.x * sign < 0) h = cplx_conj(h);
     otf[row * n + i] = h * gain[i];
@@ -132,7 +133,8 @@ __kernel void otf_power(__global cplx *field, const int m, const real scale)
 {
     const int i = get_global_id(0);
     if (i >= m) return;
-    field[i] = (cplx)(scale * cplx_abs2(field[i]), 0);
+    const cplx f = field[i];
+    field[i] = scale * cplx_mul(f, cplx_conj(f));   // the imaginary parts cancel to the last bit
 }
 
 __kernel void otf_half(__global const cplx *field, __global cplx *otf, const int n)

@@ -71,15 +71,12 @@ __kernel void psf_fft(
     __global cplx       *y,
     const int m, const int s, const int along_rows, const int sign)
 {
-    const int i = get_global_id(0);
-    const int k = get_global_id(1);
-    if (along_rows) {
-        if (i >= m / 2 || k >= m) return;
-        stockham_pass(x, y, roots, k * m, 1, m, s, i, sign);
-    } else {
-        if (i >= m || k >= m / 2) return;
-        stockham_pass(x, y, roots, i, m, m, s, k, sign);
-    }
+    const int column = get_global_id(0);
+    const int row = get_global_id(1);
+    const int j = along_rows ? column : row;        // butterfly
+    const int line = along_rows ? row : column;
+    if (j >= m / 2 || line >= m) return;
+    stockham_pass(x, y, roots, along_rows ? line * m : line, along_rows ? 1 : m, m, s, j, sign);
 }
 
 __kernel void psf_intensity(
@@ -92,7 +89,8 @@ __kernel void psf_intensity(
     const int row = get_global_id(1);
     if (row >= m || column >= m) return;
     const int i = row * m + column;
-    const real value = scale * cplx_abs2(field[i]);
-    psf[i] = value;
-    field[i] = (cplx)(value, 0);
+    const cplx f = field[i];
+    const cplx value = scale * cplx_mul(f, cplx_conj(f));   // the imaginary parts cancel to the last bit
+    psf[i] = value.x;
+    field[i] = value;
 }

@@ -22,10 +22,13 @@ static inline void stockham_pass(
     const int p = j / s, q = j - p * s;
     const cplx a = x[first + step * j];                 // q + s p is j itself
     const cplx b = x[first + step * (j + n / 2)];
-    const cplx root = roots[p * s];
+    cplx root = roots[p * s];
+    if (sign > 0) root.y = -root.y;
     const int to = first + step * (q + 2 * s * p);
     y[to] = a + b;
-    y[to + step * s] = cplx_mul(a - b, sign < 0 ? root : cplx_conj(root));
+    const cplx d = a - b;
+    // The product in whole vectors: Oclgrind's compiler splits the store of one built from two scalars.
+    y[to + step * s] = d.xx * root + d.yy * (cplx)(-root.y, root.x);
 }
 
 #endif
