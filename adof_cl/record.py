@@ -36,6 +36,8 @@ class Iteration:
         What the servo law saw: estimated pose error left.
     velocity
         Command sent: um/s along x, y, z and rad/s about z.
+    hole_xy_px
+        Where the middle of the hole's features was measured, region of interest.
     hole_bias_px
         Measured minus true position of the hole's features in camera 1, averaged; NaN without a twin.
     true_error_x_um, true_error_y_um, true_error_theta_rad, true_depth_um
@@ -59,6 +61,7 @@ class Iteration:
     epipolar_residual_px: float
     lost_features: int
     compute_ms: float
+    hole_xy_px: tuple[float, float] = (math.nan, math.nan)
     hole_bias_px: tuple[float, float] = (math.nan, math.nan)
     true_error_x_um: float = math.nan
     true_error_y_um: float = math.nan

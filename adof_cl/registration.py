@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 _FINE_PX, _COARSE_PX = 0.6, 4.0  # band both pictures are compared in: below is noise, above is shading
 _TURNS_RAD = np.radians(np.arange(-6.0, 6.01, 1.0))
 _FOUND = 0.35
+_PASSES = 3
 
 
 class Drawing(Protocol):
@@ -148,7 +149,10 @@ def register(
             f"nothing in the picture resembles the drawing (correlation {best[0]:.2f}, {_FOUND} was wanted): "
             "check focus, light and that the part is in view"
         )
-    return _refined(soft, drawing, best[1], best[2])
+    found = Registration(best[1], best[2], best[0])
+    for _ in range(_PASSES):  # each renders the drawing as the last one found it
+        found = _refined(soft, drawing, found.matrix, found.origin_px)
+    return found
 
 
 def _window(
@@ -204,4 +208,8 @@ def _refined(image: NDArray[np.float32], drawing: Drawing, matrix: Array, origin
             f"the part was found but refining moved it by {moved:.1f} px (correlation {height:.2f}): check "
             "focus and light"
         )
-    return Registration(forward @ matrix, place, float(height))
+    # A rigid part seen square on turns and, by the magnification's error, grows; shear would be noise.
+    turn = math.atan2(forward[1, 0] - forward[0, 1], forward[0, 0] + forward[1, 1])
+    scale = math.sqrt(abs(float(np.linalg.det(forward))))
+    c, s = scale * math.cos(turn), scale * math.sin(turn)
+    return Registration(np.array([[c, -s], [s, c]]) @ matrix, place, float(height))

@@ -142,23 +142,28 @@ class Drawing:
     centre_yx: tuple[float, float]
 
 
-def drawing_of(part: Peg | HolePlate) -> Drawing:
-    """Return a part's drawing, cut to where its etched marks are."""
+def drawing_of(part: Peg | HolePlate, *, over_hole: bool = False) -> Drawing:
+    """Return a part's drawing, cut to where its etched marks are.
+
+    `over_hole`: the peg as it stands over the dark hole, so that its rim can be judged as well.
+    """
     painted = paint_peg(part, None) if isinstance(part, Peg) else paint_plate(part, None)
-    radiance = painted.planes[0]
-    y = (np.arange(radiance.shape[0]) - painted.centre_yx[0]) * PITCH_UM
-    x = (np.arange(radiance.shape[1]) - painted.centre_yx[1]) * PITCH_UM
+    radiance, centre = painted.planes[0], painted.centre_yx
+    if isinstance(part, Peg) and over_hole:
+        margin = 24
+        radiance = np.pad(radiance + (1 - painted.planes[1]) * _HOLE, margin, constant_values=_HOLE)
+        centre = (centre[0] + margin, centre[1] + margin)
+    y = (np.arange(radiance.shape[0]) - centre[0]) * PITCH_UM
+    x = (np.arange(radiance.shape[1]) - centre[1]) * PITCH_UM
     far_x, far_y = np.abs(x)[None, :], np.abs(y)[:, None]
     half_x, half_y = part.width_um / 2, part.depth_um / 2
     if isinstance(part, Peg):
-        judged = (far_x < half_x - 45) & (far_y < half_y - 45)
-        return Drawing(radiance, judged, PITCH_UM, painted.centre_yx)
+        rim_um = -22.0 if over_hole else 45.0
+        return Drawing(radiance, (far_x < half_x - rim_um) & (far_y < half_y - rim_um), PITCH_UM, centre)
     reach = 6 * _CELL_UM
-    judged = (
-        ((far_x > half_x - 20) | (far_y > half_y - 20)) & (far_x < half_x + reach) & (far_y < half_y + reach)
-    )
+    judged = (far_x > half_x - 20) | (far_y > half_y - 20)
+    judged &= (far_x < half_x + reach) & (far_y < half_y + reach)
     rows = np.flatnonzero(np.abs(y) < half_y + reach + 10)
     columns = np.flatnonzero(np.abs(x) < half_x + reach + 10)
     cut = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
-    centre = (painted.centre_yx[0] - rows[0], painted.centre_yx[1] - columns[0])
-    return Drawing(radiance[cut], judged[cut], PITCH_UM, centre)
+    return Drawing(radiance[cut], judged[cut], PITCH_UM, (centre[0] - rows[0], centre[1] - columns[0]))

@@ -1,0 +1,925 @@
+"""The assembly, closed through images: autofocus, templates, calibration, coarse, fine, insertion.
+
+The loop states the little it needs of a rig as protocols; the twin and real drivers satisfy them by shape. It
+knows how the rig was drawn (`Design`) and measures the rest: where the parts are, how the stages lie to the
+cameras, where the rotation's centre is, how old a frame is when its command goes out.
+
+One iteration: both cameras' frames, each part restored with the filter of its own depth, features, depth by
+triangulation, the mask for what is left of the depth, whole stage steps. Any exception stops the stages.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from adof_cl.autofocus import focus_sweep
+from adof_cl.device import Device
+from adof_cl.errors import AdofError, TrackingError
+from adof_cl.mask import Calibration, ModelCalibration, PaperCalibration, choose_mask
+from adof_cl.optics import Mask, OpticalSystem, SlmPanel
+from adof_cl.pipeline import Blur, CameraPipeline
+from adof_cl.record import Iteration, Position, RunRecord
+from adof_cl.registration import Drawing, register
+from adof_cl.servo import ServoLaw, StageAxes, StageAxis, StageQuantiser, VelocityCommand, jog_test
+from adof_cl.slm_encode import SlmEncode
+from adof_cl.stereo import StereoRig, calibrate_camera, triangulate_relative
+from adof_cl.tracking import Measurement, Template, TrackingLimits
+
+Array = NDArray[np.float64]
+Pixels = NDArray[np.uint8]
+
+PEG, HOLE, PEG_OVER_HOLE = "peg", "hole", "peg over hole"
+POSITIONS: tuple[tuple[str, float], ...] = (
+    ("A", 4000.0),
+    ("B", 3000.0),
+    ("C", 2000.0),
+    ("D", 1000.0),
+    ("E", 787.0),
+)
+"""The paper's named depths, as inferred in docs/maths.md from its mask strengths."""
+
+
+class Frame(Protocol):
+    """What a camera gives."""
+
+    @property
+    def pixels(self) -> Pixels: ...  # noqa: D102  (protocols below: the names say it)
+    @property
+    def time_s(self) -> float: ...  # noqa: D102
+
+
+class Camera(Protocol):
+    """A source of frames, region of interest only."""
+
+    def grab(self) -> Frame: ...  # noqa: D102
+
+
+class Modulator(Protocol):
+    """A sink for panel codes."""
+
+    def show(self, codes: Pixels) -> None: ...  # noqa: D102
+
+
+class Stage(Protocol):
+    """Axes by name; um, or rad for "theta"."""
+
+    @property
+    def resolution(self) -> Mapping[str, float]: ...  # noqa: D102
+    @property
+    def speed_limits(self) -> Mapping[str, float]: ...  # noqa: D102
+    def position(self) -> Mapping[str, float]: ...  # noqa: D102
+    def move_to(self, targets: Mapping[str, float], *, speed: float | None = None) -> None: ...  # noqa: D102
+    def stop(self) -> None: ...  # noqa: D102
+    def wait_until_still(self) -> None: ...  # noqa: D102
+
+
+class Clock(Protocol):
+    """The rig's time."""
+
+    @property
+    def now_s(self) -> float: ...  # noqa: D102
+    def wait(self, duration_s: float) -> None: ...  # noqa: D102
+
+
+class Rig(Protocol):
+    """What the loop drives."""
+
+    @property
+    def camera_1(self) -> Camera: ...  # noqa: D102
+    @property
+    def camera_2(self) -> Camera: ...  # noqa: D102
+    @property
+    def slm(self) -> Modulator: ...  # noqa: D102
+    @property
+    def coarse(self) -> Stage: ...  # noqa: D102
+    @property
+    def fine(self) -> Stage: ...  # noqa: D102
+    @property
+    def clock(self) -> Clock: ...  # noqa: D102
+
+
+class PartDesign(Protocol):
+    """A part as drawn."""
+
+    @property
+    def corners_um(self) -> Array:
+        """(4, 2): -x -y, +x -y, +x +y, -x +y from the part's centre."""
+        ...
+
+
+class Design(Protocol):
+    """The rig as drawn: what the loop may know beforehand."""
+
+    @property
+    def optics_1(self) -> OpticalSystem: ...  # noqa: D102
+    @property
+    def optics_2(self) -> OpticalSystem: ...  # noqa: D102
+    @property
+    def mask_2(self) -> Mask: ...  # noqa: D102
+    @property
+    def panel(self) -> SlmPanel: ...  # noqa: D102
+    @property
+    def settling_s(self) -> float: ...  # noqa: D102
+    @property
+    def frame_rate_hz(self) -> float: ...  # noqa: D102
+    @property
+    def command_latency_s(self) -> float: ...  # noqa: D102
+    @property
+    def tilt_rad(self) -> float: ...  # noqa: D102
+    @property
+    def region_rows(self) -> int: ...  # noqa: D102
+    @property
+    def region_columns(self) -> int: ...  # noqa: D102
+    @property
+    def region_origin_yx(self) -> tuple[int, int]: ...  # noqa: D102
+    @property
+    def peg(self) -> PartDesign: ...  # noqa: D102
+    @property
+    def hole(self) -> PartDesign: ...  # noqa: D102
+    def projection(self, camera: int) -> tuple[Array, Array]: ...  # noqa: D102
+
+
+@dataclass(frozen=True)
+class Options:
+    """What an operator may choose.
+
+    Attributes
+    ----------
+    mask
+        "joint": cubic and focus chosen together from the optics; "paper": the paper's curve, focus on the
+        peg; "fixed": always `fixed_alpha_rad`.
+    stand_off_um
+        Depth of the hole under the peg's face where coarse assembly ends: the peg's tip is still above it.
+    seat_um
+        Depth of the hole's face when the peg is seated.
+    nsr
+        Noise-to-signal power ratio of the filters.
+    iteration_limit
+        The loop gives up after so many.
+    """
+
+    mask: str = "joint"
+    fixed_alpha_rad: float = 80.0
+    stand_off_um: float = 400.0
+    seat_um: float = 150.0
+    nsr: float = 0.01
+    iteration_limit: int = 600
+
+
+_FEATURES = (0, 2)  # opposite corners: whatever blurs a corner moves both alike about the part's middle
+_GATE_UM = 900.0  # the peg's tip is 300 um under its face: above this depth nothing can touch
+_LOST_LIMIT = 12
+_TURN_RAD = 0.004  # a template 20 pixels wide turned by this is off by 0.04 at its rim
+_INSET_PX = {PEG: 12.0, HOLE: -8.0}  # templates lie on the peg's face, and on the plate around the hole
+_BENT_PX = 0.5  # a target whose two features moved apart by more was half hidden
+_DEFOCUS_SHARE = 0.6  # largest |psi| / (3 alpha) of the joint mask
+
+Milestone = Callable[[str], None]
+"""Told when a stage of the run has been completed: "coarse", "fine", "insert"."""
+Progress = Callable[[str, str], None]
+"""Told (stage, sentence) as the run goes on."""
+Observer = Callable[[Iteration, float], Iteration]
+"""Given each iteration and its frame's time; may add what it knows, and returns it."""
+
+
+@dataclass
+class Features:
+    """Where one part's features were last seen in one camera."""
+
+    xy_px: Array
+    covariance: Array
+    measured: list[Measurement]
+
+    @property
+    def middle(self) -> Array:
+        """Middle of the two corners: what blurs a corner symmetrically leaves it in place."""
+        return np.asarray(self.xy_px.mean(axis=0))
+
+    @property
+    def middle_covariance(self) -> Array:
+        """Of `middle`."""
+        return np.asarray(self.covariance.sum(axis=0) / len(self.covariance) ** 2)
+
+    def bent_px(self, taught: Features) -> float:
+        """How far the features' distance differs from what was taught: a part is rigid."""
+        return float(np.linalg.norm(np.diff(self.xy_px - taught.xy_px, axis=0)))
+
+    @property
+    def lost(self) -> int:
+        """How many features were not found."""
+        return sum(m.lost for m in self.measured)
+
+
+class _Eye:
+    """One camera as the loop uses it: its pipeline, its drawn geometry, the mask its light passes."""
+
+    def __init__(self, number: int, camera: Camera, device: Device, design: Design, nsr: float) -> None:
+        self.number = number
+        self.camera = camera
+        self.optics = design.optics_1 if number == 1 else design.optics_2
+        self.pipeline = CameraPipeline(
+            device, self.optics, (design.region_rows, design.region_columns), (PEG, HOLE), nsr=nsr
+        )
+        matrix, origin = design.projection(number)
+        self.matrix: Array = np.asarray(matrix, dtype=np.float64)
+        self.origin: Array = np.asarray(origin, dtype=np.float64) - np.array(design.region_origin_yx[::-1])
+        # Camera 1 looks along z; camera 2 is turned about y, so that part of x is depth to it.
+        tilt = 0.0 if number == 1 else design.tilt_rad
+        self.depth_axis = np.array([-math.sin(tilt), 0.0, math.cos(tilt)])
+        self.mask = Mask() if number == 1 else design.mask_2
+        self.seen: dict[str, Features] = {}
+        self.taught: dict[str, Features] = {}
+        self.pictures: dict[str, Pixels] = {}
+        self.turned_rad: dict[str, float] = {}
+        self.taught_at_rad = 0.0
+
+    def blur(self, world_um: Array) -> Blur:
+        """Return what this camera's optics do to a part at a place, as drawn."""
+        return Blur.of(self.mask, self.optics, float(self.depth_axis @ world_um))
+
+    def project(self, world_um: Array) -> Array:
+        """Return where the drawing says a place is seen."""
+        return np.asarray(self.matrix @ world_um + self.origin)
+
+    def measure(
+        self, frame: Pixels, blurs: Mapping[str, Blur | None], expected: Mapping[str, Array]
+    ) -> dict[str, Features]:
+        """Measure parts; remembers where they were seen."""
+        found = self.pipeline(frame, blurs, expected)
+        for part, measured in found.items():
+            covariance = np.stack([m.covariance for m in measured])
+            # A lost feature stays where it was expected, and weighs next to nothing.
+            covariance = np.where(np.isfinite(covariance), covariance, 0.0)
+            for k, m in enumerate(measured):
+                if m.lost:
+                    covariance[k] = 25.0 * np.eye(2)
+            self.seen[part] = Features(np.stack([m.feature_xy_px for m in measured]), covariance, measured)
+        return {part: self.seen[part] for part in found}
+
+
+class Assembly:
+    """One assembly run on one rig.
+
+    Parameters
+    ----------
+    device
+        The opened OpenCL device.
+    rig, design, drawings
+        What is driven, how it was drawn, and its parts' faces: "peg", "hole", and "peg over hole" with the
+        rim that shows there.
+    record
+        Filled in as the run goes on; complete up to the last iteration whatever happens.
+    options, progress, observer, milestone
+        Choices; who is told of progress; who may add truth to each iteration; who is told of stages done.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        rig: Rig,
+        design: Design,
+        drawings: Mapping[str, Drawing],
+        record: RunRecord,
+        *,
+        options: Options | None = None,
+        progress: Progress | None = None,
+        observer: Observer | None = None,
+        milestone: Milestone | None = None,
+    ) -> None:
+        self.rig = rig
+        self.design = design
+        self.drawings = drawings
+        self.record = record
+        self.options = options or Options()
+        self._tell = progress or (lambda _stage, _sentence: None)
+        self._observe = observer or (lambda iteration, _time_s: iteration)
+        self._reached = milestone or (lambda _stage: None)
+        self._encoder = SlmEncode(device, design.panel, design.optics_1)
+        self.eyes = (
+            _Eye(1, rig.camera_1, device, design, self.options.nsr),
+            _Eye(2, rig.camera_2, device, design, self.options.nsr),
+        )
+        self._calibration: Calibration = (
+            PaperCalibration() if self.options.mask == "paper" else ModelCalibration(design.optics_1)
+        )
+        self.world: dict[str, Array] = {PEG: np.zeros(3), HOLE: np.zeros(3)}
+        """Where the parts are, as well as known: camera 1's axes, z the depth from its plane in focus."""
+        self.stereo: StereoRig | None = None
+        self._world_from_stage = np.zeros(3)
+        self._rotation_arm_um = np.zeros(2)
+        self._fine_px_per_um = np.eye(2)
+        self._target: dict[str, float] = {}
+        self._positions_left = list(POSITIONS)
+        self._shown = False
+        self._arm_at_rad = 0.0
+        self._lost_in_a_row = 0
+        self._last_move_um = np.zeros(3)
+
+    # ---- the whole run ------------------------------------------------------------------------------------
+
+    def run(self) -> RunRecord:
+        """Do the assembly; the stages are at rest when it returns or raises."""
+        with self.stages_stopped_afterwards():
+            self.prepare()
+            for stage, carry_out in (("coarse", self.coarse), ("fine", self.fine), ("insert", self.insert)):
+                carry_out()
+                self._reached(stage)
+            self.record.docked = True
+            self.record.end_state = "docked"
+        return self.record
+
+    @contextmanager
+    def stages_stopped_afterwards(self) -> Iterator[None]:
+        """Stop both stages however the block ends, and say in the record how it ended."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            self.record.end_state = "interrupted"
+            raise
+        except AdofError as failure:
+            self.record.end_state = f"stopped: {failure}"
+            raise
+        except BaseException as failure:
+            self.record.end_state = f"failed: {type(failure).__name__}"
+            raise
+        finally:
+            self.rig.coarse.stop()
+            self.rig.fine.stop()
+
+    def prepare(self) -> None:
+        """Find, focus, learn and calibrate: everything before the first servo step."""
+        self.autofocus()
+        self.take_templates(PEG, self.eyes, self.drawings[PEG])
+        self.take_templates(HOLE, self.eyes, self.drawings[HOLE])
+        self.calibrate()
+
+    # ---- looking ------------------------------------------------------------------------------------------
+
+    def show(self, mask: Mask) -> None:
+        """Put a mask on the modulator and wait until it stands."""
+        eye = self.eyes[0]
+        if mask == eye.mask and self._shown:
+            return
+        self.rig.slm.show(self._encoder.codes(mask))
+        eye.mask = mask
+        self._shown = True
+        self.rig.clock.wait(self.design.settling_s)
+
+    def look(self) -> tuple[Frame, Frame]:
+        """Take the next pair of frames."""
+        return self.rig.camera_1.grab(), self.rig.camera_2.grab()
+
+    def focused(self, depth_um: float) -> Mask:
+        """Return the mask that brings a depth into focus and codes nothing."""
+        return Mask(0.0, -self.design.optics_1.psi_rad(depth_um))
+
+    def mask_for(self, near_um: float, far_um: float) -> Mask:
+        """Choose the mask for a depth range by the operator's rule."""
+        if self.options.mask == "fixed":
+            return Mask(self.options.fixed_alpha_rad)
+        optics = self.design.optics_1
+        if self.options.mask == "paper":
+            return choose_mask(near_um, far_um, self._calibration, optics)
+        mask = choose_mask(near_um, far_um, self._calibration, optics, joint=True)
+        # The criterion keeps a line pattern visible; tracking wants the whole band of the sensor, which lies
+        # within |u| < 2 (1 - |psi| / (3 alpha)): docs/maths.md, eq. O6.
+        defocus = max(abs(mask.psi_rad(optics, near_um)), abs(mask.psi_rad(optics, far_um)))
+        return replace(mask, alpha_rad=max(mask.alpha_rad, defocus / (3 * _DEFOCUS_SHARE)))
+
+    # ---- preparation --------------------------------------------------------------------------------------
+
+    def autofocus(self) -> None:
+        """Find both parts' depths by refocusing on the modulator; nothing moves (decision 0004)."""
+        eye = self.eyes[0]
+        for part, low_um, high_um in ((PEG, -600.0, 600.0), (HOLE, 3000.0, 4600.0)):
+            rows, columns = self._window(eye.project(self.world[part]), 75 if part == PEG else 130)
+
+            def picture(depth_um: float, at: tuple[slice, slice] = (rows, columns)) -> Pixels:
+                self.show(self.focused(depth_um))
+                return self.rig.camera_1.grab().pixels[at]
+
+            found = focus_sweep(picture, low_um, high_um)
+            self.world[part] = np.array([0.0, 0.0, found.position])
+            self._tell("autofocus", f"{part} at {found.position:.0f} ± {found.sigma:.0f} µm")
+
+    def take_templates(self, part: str, eyes: Sequence[_Eye], drawing: Drawing) -> None:
+        """Take pictures of a part's features in focus, tied to its drawing."""
+        self.show(self.focused(float(self.world[part][2])))
+        frames = self.look()
+        images = [frames[0].pixels]
+        for eye, frame in zip(eyes, frames, strict=False):
+            if eye.number == 2:
+                restored = eye.pipeline.restored(frame.pixels, {part: eye.blur(self.world[part])})
+                images.append(restored[part])
+            known = part in eye.seen
+            expected = eye.seen[part].middle if known else eye.project(self.world[part])
+            reach = 15.0 if known else 60.0 if eye.number == 1 else 30.0
+            found = register(images[-1], drawing, eye.matrix[:, :2], expected_px=expected, reach_px=reach)
+            corners = found.pixels(self._design_of(part).corners_um[list(_FEATURES)])
+            self._keep_templates(eye, part, images[-1], corners)
+            if eye.number == 1:
+                middle = np.linalg.solve(eye.matrix[:, :2], found.origin_px - eye.origin)
+                self.world[part] = np.array([*middle, self.world[part][2]])
+        self._tell("templates", f"{part}: features taken in focus")
+
+    def _design_of(self, part: str) -> PartDesign:
+        return self.design.peg if part == PEG else self.design.hole
+
+    def _keep_templates(self, eye: _Eye, part: str, image: Pixels, corners: Array) -> None:
+        covariance = np.broadcast_to(0.01 * np.eye(2), (len(corners), 2, 2))
+        eye.seen[part] = eye.taught[part] = Features(corners, covariance, [])
+        eye.pictures[part] = image
+        eye.turned_rad[part] = 0.0
+        eye.taught_at_rad = self.rig.coarse.position()["theta"]
+        eye.pipeline.set_templates(part, cut_templates(image, corners, part), TrackingLimits(mismatch=0.7))
+
+    def _turn_templates(self) -> None:
+        """Turn the hole's templates with the hole, as each camera sees a turn."""
+        theta = self.rig.coarse.position()["theta"]
+        for eye in self.eyes:
+            turned = theta - eye.taught_at_rad
+            if abs(turned - eye.turned_rad[HOLE]) < _TURN_RAD:
+                continue
+            eye.turned_rad[HOLE] = turned
+            c, s = math.cos(turned), math.sin(turned)
+            block = eye.matrix[:, :2]
+            seen = block @ np.array([[c, -s], [s, c]]) @ np.linalg.inv(block)
+            corners = eye.taught[HOLE].xy_px
+            eye.pipeline.set_templates(HOLE, cut_templates(eye.pictures[HOLE], corners, HOLE, seen))
+
+    def _window(self, centre_xy: Array, half: int) -> tuple[slice, slice]:
+        rows, columns = self.design.region_rows, self.design.region_columns
+        x, y = (round(float(v)) for v in centre_xy)
+        return slice(max(0, y - half), min(rows, y + half)), slice(max(0, x - half), min(columns, x + half))
+
+    def calibrate(self) -> None:
+        """Step the hole through the work volume; learn both cameras, the rotation's centre and the fine axes.
+
+        The hole's middle is the target: the stage's own readings are the world it is calibrated in.
+        """
+        coarse = self.rig.coarse
+        start = dict(coarse.position())
+        self._target = dict(start)
+        depth = float(self.world[HOLE][2])
+        self._world_from_stage = self.world[HOLE] - np.array([start["x"], start["y"], start["z"]])
+        points: list[list[float]] = []
+        pixels: tuple[list[Array], list[Array]] = ([], [])
+        covariances: tuple[list[Array], list[Array]] = ([], [])
+        planes = np.linspace(depth, 800.0, 4)
+        # About where the peg stands, leaning to the side on which camera 2 does not see the peg in front.
+        middle = np.array([start["x"], start["y"]]) + (self.world[PEG] - self.world[HOLE])[:2]
+        steps = ((0.0, 0.0), (600.0, -300.0), (600.0, 300.0), (-400.0, 300.0), (-400.0, -300.0))
+        hidden = 0
+        for number, plane in enumerate(planes):
+            self._tell("calibration", f"plane {number + 1} of {len(planes)}, {plane:.0f} µm deep")
+            for dx, dy in steps:
+                there = {"x": middle[0] + dx, "y": middle[1] + dy, "z": start["z"] + plane - depth}
+                seen = self._hole_at(there)
+                if any(features.lost or features.bent_px(eye.taught[HOLE]) > _BENT_PX
+                       for features, eye in zip(seen, self.eyes, strict=True)):  # fmt: skip
+                    hidden += 1
+                    continue
+                reading = coarse.position()
+                points.append([reading["x"], reading["y"], reading["z"]])
+                for k, features in enumerate(seen):
+                    pixels[k].append(features.middle)
+                    covariances[k].append(features.middle_covariance)
+        self._hole_at({axis: start[axis] for axis in ("x", "y", "z")})
+        volume = np.array(
+            [
+                [start["x"] - 600, start["y"] - 600, start["z"] - depth],
+                [start["x"] + 600, start["y"] + 600, start["z"] + 200],
+            ]
+        )
+        cameras = [
+            calibrate_camera(
+                np.array(points),
+                np.array(pixels[k]),
+                covariance_px2=np.array(covariances[k]),
+                work_volume_um=volume,
+                camera_id=f"camera {k + 1}",
+            )
+            for k in range(2)
+        ]
+        self.stereo = StereoRig(cameras[0], cameras[1])
+        sigma_z = self.stereo.sigma_z_um()
+        tilt = math.degrees(self.stereo.angle_rad)
+        self._tell(
+            "calibration",
+            f"{len(points)} places ({hidden} hidden behind the peg), cameras {tilt:.2f}° apart, "
+            f"depth good to {sigma_z:.2f} µm",
+        )
+        self._learn_rotation(start)
+        self._learn_fine_stage()
+
+    def _hole_at(self, there: Mapping[str, float]) -> tuple[Features, Features]:
+        """Move the hole, focus on it, and measure it in both cameras."""
+        before = self._hole_world()
+        self.rig.coarse.move_to(there)
+        self.rig.coarse.wait_until_still()
+        world = self._hole_world()
+        self.world[HOLE] = world
+        self.show(self.focused(float(world[2])))
+        frames = self.look()
+        found = []
+        for eye, frame in zip(self.eyes, frames, strict=True):
+            expected = eye.seen[HOLE].xy_px + eye.matrix @ (world - before)
+            features = eye.measure(frame.pixels, {HOLE: eye.blur(world)}, {HOLE: expected})[HOLE]
+            found.append(features)
+        return found[0], found[1]
+
+    def _hole_world(self) -> Array:
+        reading = self.rig.coarse.position()
+        return np.array([reading["x"], reading["y"], reading["z"]]) + self._world_from_stage
+
+    def _learn_rotation(self, start: Mapping[str, float]) -> None:
+        """Turn the hole a little and see about which point it turned."""
+        assert self.stereo is not None
+        camera = self.stereo.camera_1
+        before = self.eyes[0].seen[HOLE].middle
+        angle = -math.copysign(0.03, start["theta"]) if start["theta"] else 0.03
+        after = self._hole_at({"theta": start["theta"] + angle})[0].middle
+        turned = self.rig.coarse.position()["theta"] - start["theta"]
+        moved = camera.motion_um((after - before)[None])[0]
+        jog_test([[turned]], [[self._seen_turn()]])
+        c, s = math.cos(turned), math.sin(turned)
+        # moved = (R - 1) arm, with the arm from the rotation's centre to the hole's middle.
+        self._rotation_arm_um = np.linalg.solve(np.array([[c - 1, -s], [s, c - 1]]), moved)
+        self._arm_at_rad = start["theta"]
+        self._hole_at({"theta": start["theta"]})
+
+    def _seen_turn(self) -> float:
+        """Return how far camera 1 sees the hole turned since its templates were taken."""
+        assert self.stereo is not None
+        block, eye = self.stereo.camera_1.matrix_px_per_um[:, :2], self.eyes[0]
+        taught, seen = (np.diff(f.xy_px, axis=0)[0] for f in (eye.taught[HOLE], eye.seen[HOLE]))
+        return _turn_between(np.linalg.solve(block, taught), np.linalg.solve(block, seen))
+
+    def _learn_fine_stage(self) -> None:
+        """Jog the peg along both fine axes; refuse a stage that does not go where it is sent."""
+        assert self.stereo is not None
+        fine, eye = self.rig.fine, self.eyes[0]
+        start = dict(fine.position())
+        self.show(self.focused(float(self.world[PEG][2])))
+
+        def peg_middle() -> Array:
+            frame = self.rig.camera_1.grab()
+            found = eye.measure(frame.pixels, {PEG: eye.blur(self.world[PEG])}, {PEG: eye.seen[PEG].xy_px})[
+                PEG
+            ]
+            if found.lost:
+                raise TrackingError("the peg was lost while its stage was jogged: check its light and grip")
+            return found.middle
+
+        home = peg_middle()
+        columns = []
+        for axis in ("x", "y"):
+            fine.move_to({axis: start[axis] + 60.0})
+            fine.wait_until_still()
+            columns.append((peg_middle() - home) / 60.0)
+            fine.move_to({axis: start[axis]})
+            fine.wait_until_still()
+        self._fine_px_per_um = np.stack(columns, axis=1)
+        observed = self.stereo.camera_1.motion_um(60.0 * np.stack(columns))
+        jog_test(60.0 * np.eye(2), observed)
+        peg_middle()
+
+    # ---- the loop -----------------------------------------------------------------------------------------
+
+    def coarse(self) -> None:
+        """Bring the hole under the peg: x, y, theta from the image, z from depth, to the stand-off."""
+        assert self.stereo is not None
+        design = self.design
+        axes = StageAxes(
+            x=replace(self._axis("x", "um"), hysteresis=0.3),
+            y=replace(self._axis("y", "um"), hysteresis=0.3),
+            theta=replace(self._axis("theta", "rad"), dead_band=5e-4, hysteresis=2e-4),
+            z=replace(self._axis("z", "um"), dead_band=1.0, hysteresis=0.5),
+        )
+        period_s = design.settling_s + 2 / design.frame_rate_hz
+        law = ServoLaw.from_delay(self.stereo.camera_1, axes, period_s, period_s)
+        quantiser = StageQuantiser(axes)
+        self._target = dict(self.rig.coarse.position())
+        self.show(self._next_mask())
+        taught, resting = False, 0
+        last_s = self.rig.clock.now_s - period_s
+        while resting < 5:
+            sight = self._see()
+            now_s = self.rig.clock.now_s
+            aligned = math.hypot(*sight.error_um) < 15 and abs(sight.error_rad) < 0.01
+            wanted = self.options.stand_off_um if aligned and taught else _GATE_UM
+            if sight.usable:
+                error = law.error(sight.hole_px, sight.desired_px, sight.centre_um, wanted - sight.depth_um)
+                command = law.command(error, quantiser.wake(error))
+                move = quantiser.move(command, now_s - last_s).array
+            else:
+                command, move = VelocityCommand.zero(), np.zeros(4)
+            last_s = now_s
+            mask = self._next_mask()
+            codes = None if mask == self.eyes[0].mask else self._encoder.codes(mask)
+            compute_ms = 1e3 * (time.perf_counter() - sight.begun)
+            self._move(move)
+            self._note("coarse", sight, wanted, command.array, compute_ms)
+            self._change(mask, codes)
+            if not sight.usable:
+                continue
+            if aligned and not taught and abs(sight.depth_um - _GATE_UM) < 30:
+                self._teach_again()
+                taught = True
+                last_s = self.rig.clock.now_s - period_s
+            resting = resting + 1 if quantiser.at_rest and wanted == self.options.stand_off_um else 0
+        self.rig.coarse.wait_until_still()
+        self._tell("coarse", f"hole at its stand-off, {sight.depth_um:.1f} µm under the peg's face")
+
+    def fine(self) -> None:
+        """Centre the peg over the hole with the fine stage, from features taken in focus once more."""
+        self._teach_again()
+        self._centre(tolerance_um=0.25, wanted_um=self.options.stand_off_um)
+        self._tell("fine", "peg centred over the hole")
+
+    def insert(self) -> None:
+        """Raise the hole around the peg, the fine stage keeping it centred."""
+        self._centre(tolerance_um=0.25, wanted_um=self.options.seat_um)
+        self._tell("insert", "peg seated")
+
+    def _centre(self, *, tolerance_um: float, wanted_um: float) -> None:
+        """Servo the peg's x, y on the fine stage and the hole's z, until both rest."""
+        assert self.stereo is not None
+        fine = self.rig.fine
+        target = dict(fine.position())
+        self._target = dict(self.rig.coarse.position())
+        step_um = 12.0  # of z at a time: x and y keep up with the walk of half a degree
+        inverse = np.linalg.inv(self._fine_px_per_um)
+        resting = 0
+        mean_um, mean_z, count = np.zeros(2), 0.0, 0
+        while resting < 6:
+            sight = self._see()
+            mask = self._next_mask()
+            codes = None if mask == self.eyes[0].mask else self._encoder.codes(mask)
+            z_left = wanted_um - sight.depth_um
+            clear = math.hypot(*sight.error_um) < 15
+            if sight.usable:
+                # A running mean over up to eight frames: the stage is finer than one frame's noise.
+                count = min(count + 1, 8) if abs(z_left) < 2 * step_um else 1
+                mean_um += (sight.error_um - mean_um) / count
+                mean_z += (z_left - mean_z) / count
+                peg_px = self.stereo.camera_1.matrix_px_per_um[:, :2] @ -mean_um
+                move = inverse @ peg_px * (0.5 if count < 3 else 0.25)
+                dz = float(np.clip(0.5 * mean_z, -step_um, step_um)) if clear else 0.0
+            else:
+                move, dz = np.zeros(2), 0.0
+            compute_ms = 1e3 * (time.perf_counter() - sight.begun)
+            target = {"x": target["x"] + float(move[0]), "y": target["y"] + float(move[1])}
+            fine.move_to(target)
+            # What the stage was told to mend is mended: the mean starts again from there.
+            mean_um -= np.linalg.solve(
+                self.stereo.camera_1.matrix_px_per_um[:, :2], -self._fine_px_per_um @ move
+            )
+            mean_z -= dz
+            self._move(np.array([0.0, 0.0, 0.0, dz]))
+            self._note("fine" if wanted_um == self.options.stand_off_um else "insert", sight, wanted_um,
+                       np.array([move[0], move[1], 0.0, dz]), compute_ms)  # fmt: skip
+            self._change(mask, codes)
+            self._last_peg_move_px = self._fine_px_per_um @ move
+            calm = sight.usable and count >= 6 and math.hypot(*mean_um) < tolerance_um and abs(mean_z) < 1.0
+            resting = resting + 1 if calm else 0
+        fine.wait_until_still()
+        self.rig.coarse.wait_until_still()
+
+    def _teach_again(self) -> None:
+        """Let everything come to rest and take the features of both parts anew, in focus.
+
+        In camera 1 only: to camera 2 the peg by now hides some of the marks around the hole.
+        """
+        self.rig.coarse.wait_until_still()
+        self.rig.fine.wait_until_still()
+        self.take_templates(PEG, self.eyes[:1], self.drawings[PEG_OVER_HOLE])
+        self.take_templates(HOLE, self.eyes[:1], self.drawings[HOLE])
+        self._last_move_um = np.zeros(3)
+        self.show(self._next_mask())
+
+    def _axis(self, name: str, unit: Literal["um", "rad"]) -> StageAxis:
+        stage = self.rig.coarse
+        return StageAxis(unit, stage.resolution[name], 0.8 * stage.speed_limits[name])
+
+    def _next_mask(self) -> Mask:
+        """Choose the mask for where the parts are; a mask that is as good stays, for changing costs time."""
+        peg, hole = float(self.world[PEG][2]), float(self.world[HOLE][2])
+        wanted = self.mask_for(min(peg, hole, 0.0), max(peg, hole))
+        now = self.eyes[0].mask
+        close = (
+            abs(wanted.alpha_rad - now.alpha_rad) < 0.25
+            and abs(wanted.focus_psi_rad - now.focus_psi_rad) < 0.25
+        )
+        return now if close else wanted
+
+    def _change(self, mask: Mask, codes: Pixels | None) -> None:
+        if codes is not None:
+            self.rig.slm.show(codes)
+            self.eyes[0].mask = mask
+            self.rig.clock.wait(self.design.settling_s)
+
+    def _move(self, steps: Array) -> None:
+        """Send the coarse stage on by x, y, theta, z; what was sent before is not forgotten."""
+        for axis, step in zip(("x", "y", "theta", "z"), steps.tolist(), strict=True):
+            self._target[axis] += step
+        if np.any(steps):
+            self.rig.coarse.move_to(self._target)
+        self._last_move_um = np.array([steps[0], steps[1], steps[3]])
+        self.world[HOLE] = self.world[HOLE] + self._last_move_um
+
+    def _see(self) -> _Sight:
+        """Take a pair of frames and say where the parts are, and where the hole should be."""
+        assert self.stereo is not None
+        frames = self.look()
+        begun = time.perf_counter()
+        self._turn_templates()
+        for eye, frame in zip(self.eyes, frames, strict=True):
+            expected = {part: eye.seen[part].xy_px for part in (PEG, HOLE)}
+            expected[HOLE] = expected[HOLE] + eye.matrix @ self._last_move_um
+            blurs = {part: eye.blur(self.world[part]) for part in (PEG, HOLE)}
+            eye.measure(frame.pixels, blurs, expected)
+        seen = [eye.seen for eye in self.eyes]
+        lost = sum(s[part].lost for s in seen for part in (PEG, HOLE))
+        fix = triangulate_relative(
+            self.stereo,
+            seen[0][PEG].middle,
+            seen[1][PEG].middle,
+            seen[0][HOLE].middle,
+            seen[1][HOLE].middle,
+            seen[0][PEG].middle_covariance + seen[0][HOLE].middle_covariance,
+            seen[1][PEG].middle_covariance + seen[1][HOLE].middle_covariance,
+        )
+        self._lost_in_a_row = self._lost_in_a_row + 1 if lost else 0
+        if self._lost_in_a_row > _LOST_LIMIT:
+            reasons = [m.reason for s in seen for part in (PEG, HOLE) for m in s[part].measured if m.lost]
+            raise TrackingError(
+                f"features were lost for {_LOST_LIMIT} frames in a row ({reasons[0]}): check light and view, "
+                "then start again"
+            )
+        if not lost:
+            self.world[HOLE] = self.world[PEG] + fix.xyz_um
+        block = self.stereo.camera_1.matrix_px_per_um[:, :2]
+        peg, hole = seen[0][PEG], seen[0][HOLE]
+        desired = self._desired(block, peg)
+        middle_z = float(self.world[HOLE][2] - self._world_from_stage[2])
+        turned = self.rig.coarse.position()["theta"] - self._arm_at_rad
+        c, s = math.cos(turned), math.sin(turned)
+        arm = np.array([[c, -s], [s, c]]) @ self._rotation_arm_um
+        at = np.linalg.solve(block, hole.middle - self.stereo.camera_1.project([0.0, 0.0, middle_z]))
+        return _Sight(
+            begun=begun,
+            frame=frames[0],
+            hole_px=hole.xy_px,
+            desired_px=desired,
+            centre_um=np.array([*(at - arm), middle_z]),
+            error_um=np.linalg.solve(block, desired.mean(axis=0) - hole.middle),
+            error_rad=_turn_between(
+                np.linalg.solve(block, hole.xy_px[1] - hole.xy_px[0]),
+                np.linalg.solve(block, desired[1] - desired[0]),
+            ),
+            depth_um=float(fix.xyz_um[2]),
+            depth_sigma_um=float(fix.sigma_um[2]),
+            residual_px=float(fix.residual_px),
+            lost=lost,
+            ssd_hole=float(np.mean([m.ssd for m in hole.measured])),
+            ssd_peg=float(np.mean([m.ssd for m in peg.measured])),
+        )
+
+    def _desired(self, block: Array, peg: Features) -> Array:
+        """Return where the hole's corners belong: around the peg's middle, turned as the peg is."""
+        features = list(_FEATURES)
+        drawn = self.design.peg.corners_um[features]
+        turn = _turn_between(drawn[1] - drawn[0], np.linalg.solve(block, peg.xy_px[1] - peg.xy_px[0]))
+        c, s = math.cos(turn), math.sin(turn)
+        corners = self.design.hole.corners_um[features] @ np.array([[c, s], [-s, c]])
+        return np.asarray(peg.middle + corners @ block.T)
+
+    def _note(self, stage: str, sight: _Sight, wanted_um: float, velocity: Array, compute_ms: float) -> None:
+        """Add one iteration to the record, and a named position where the hole passes it."""
+        mask = self.eyes[0].mask
+        number = len(self.record.iterations)
+        if number >= self.options.iteration_limit:
+            raise TrackingError(
+                f"the loop did not come to rest within {self.options.iteration_limit} iterations: look at "
+                "the servo errors in the report"
+            )
+        vx, vy, vtheta, vz = velocity.tolist()
+        iteration = Iteration(
+            number=number,
+            time_s=sight.frame.time_s,
+            stage=stage,
+            alpha_rad=mask.alpha_rad,
+            focus_psi_rad=mask.focus_psi_rad,
+            hole_depth_um=sight.depth_um,
+            hole_depth_sigma_um=sight.depth_sigma_um,
+            error_x_um=float(sight.error_um[0]),
+            error_y_um=float(sight.error_um[1]),
+            error_theta_rad=sight.error_rad,
+            error_z_um=wanted_um - sight.depth_um,
+            velocity=(vx, vy, vz, vtheta),
+            ssd_hole=sight.ssd_hole,
+            ssd_peg=sight.ssd_peg,
+            epipolar_residual_px=sight.residual_px,
+            lost_features=sight.lost,
+            compute_ms=compute_ms,
+            hole_xy_px=tuple(sight.hole_px.mean(axis=0).tolist()),
+        )
+        iteration = self._observe(iteration, sight.frame.time_s)
+        self.record.iterations.append(iteration)
+        self._tell(
+            stage,
+            f"depth {sight.depth_um:7.1f} µm  α {mask.alpha_rad:5.1f}  "
+            f"x {sight.error_um[0]:7.1f}  y {sight.error_um[1]:7.1f} µm  θ {1e3 * sight.error_rad:6.2f} mrad",
+        )
+        passed = [p for p in self._positions_left if number == 0 or sight.depth_um <= p[1]]
+        if passed and stage == "coarse" and sight.usable:
+            name = passed[-1][0] if number else passed[0][0]
+            self._positions_left = self._positions_left[
+                1 + [p[0] for p in self._positions_left].index(name) :
+            ]
+            images = self.eyes[0].pipeline.last_images()
+            bias = np.array(iteration.hole_bias_px) * self.design.optics_1.object_pitch_um
+            depth = iteration.true_depth_um
+            self.record.positions.append(
+                Position(
+                    name=name,
+                    depth_um=depth if math.isfinite(depth) else sight.depth_um,
+                    depth_est_um=sight.depth_um,
+                    alpha=mask.alpha_rad,
+                    focus_psi=mask.focus_psi_rad,
+                    ssd_hole=sight.ssd_hole,
+                    ssd_peg=sight.ssd_peg,
+                    lateral_bias_um=(float(bias[0]), float(bias[1])),
+                    raw=sight.frame.pixels,
+                    restored_hole=images[HOLE],
+                    restored_peg=images[PEG],
+                )
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class _Sight:
+    """What one pair of frames says."""
+
+    begun: float
+    frame: Frame
+    hole_px: Array
+    desired_px: Array
+    centre_um: Array
+    error_um: Array
+    error_rad: float
+    depth_um: float
+    depth_sigma_um: float
+    residual_px: float
+    lost: int
+    ssd_hole: float
+    ssd_peg: float
+
+    @property
+    def usable(self) -> bool:
+        return self.lost == 0
+
+
+def cut_templates(image: Pixels, corners: Array, part: str, seen_turn: Array | None = None) -> list[Template]:
+    """Cut the templates of a part's features where nothing but the part is, each anchored at its corner.
+
+    Parameters
+    ----------
+    image
+        In focus, or restored.
+    corners : (k, 2)
+        The features in it, (x, y).
+    seen_turn : (2, 2), optional
+        The pictures are turned by this about their corners first: how the camera sees the part turned.
+    """
+    templates = []
+    for corner in corners:
+        inward = np.sign(corners.mean(axis=0) - corner)
+        centre = corner + _INSET_PX[part] * inward
+        template = Template.cut(image, centre)
+        anchor = template.anchor_yx + (corner - centre)[::-1]
+        if seen_turn is not None:
+            offset = seen_turn @ (centre - corner)
+            warp = np.column_stack([seen_turn, corner - seen_turn @ corner])
+            turned = cv2.warpAffine(image, warp, image.shape[::-1], flags=cv2.INTER_CUBIC)
+            noise = template.noise
+            template = Template.cut(turned, corner + offset, noise=noise)
+            anchor = template.anchor_yx - offset[::-1]
+        templates.append(template.anchored(anchor))
+    return templates
+
+
+def _turn_between(before: Array, after: Array) -> float:
+    """Return the angle from one direction to another, (-pi, pi]."""
+    cross = before[0] * after[1] - before[1] * after[0]
+    return math.atan2(float(cross), float(before @ after))
