@@ -79,3 +79,22 @@ def gain_offset_real(rows: int, columns: int, span: float) -> float:
     value by eps/2 of the window's span, in standard deviations of the place, twice over.
     """
     return eps("float32") * (2 * (rows + columns + 2) + 4 * span + 8)
+
+
+# ---- restoration ------------------------------------------------------------------------------------------
+
+
+def restore_relative_l2(precision: str, largest_gain: float = 1.0) -> float:
+    """Relative L2 limit of a restored frame.
+
+    The project's bound: 5e-7 in float32, 1e-14 in float64: four and fifty eps, for some twenty passes whose
+    roundings add like a random walk. Noise of the transforms is white, a filter amplifies its share at high
+    frequencies by up to `largest_gain`, while the frame's own power sits at low ones.
+    """
+    bound = 5e-7 if precision == "float32" else 1e-14
+    return bound * max(1.0, largest_gain / 5)
+
+
+def wiener_relative(precision: str) -> float:
+    """Limit of |dG|/|G| for exact axes: a complex product, a squared modulus, a quotient, a product."""
+    return 8 * eps(precision)
