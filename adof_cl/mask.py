@@ -80,7 +80,7 @@ class PaperCalibration:
         d_mm = min(depth_um, self.deepest_um) / 1000
         if depth_um <= self.shallowest_um:
             return 0.0
-        return max(0.0, 0.780 * d_mm**2 + 12.616 * d_mm - 9.440)
+        return 0.780 * d_mm**2 + 12.616 * d_mm - 9.440
 
     def depth_um(self, alpha_rad: float) -> float:
         """Return the depth range `alpha_rad` covers, clamped to the paper's range.

@@ -29,8 +29,9 @@
 //
 // Error: relative L2 of the psf below 5e-7 in float, 1e-15 in double, at m = 1024 (PoCL).
 
-#include "stockham.h"
+// phase_turns.h first: it forbids contraction, so that psf_intensity's imaginary parts cancel.
 #include "phase_turns.h"
+#include "stockham.h"
 
 __kernel void psf_panel(
     __global const uchar *codes,

@@ -81,6 +81,19 @@ def test_the_models_crossing_is_the_last_one_of_the_exact_contrast() -> None:
     )
 
 
+def test_a_dip_in_the_crossings_does_not_make_a_stronger_mask_cover_less() -> None:
+    class Dipping(ModelCalibration):
+        def _last_crossings(self, u: float) -> tuple[np.ndarray, np.ndarray]:
+            alpha, psi = super()._last_crossings(u)
+            psi[200:260] = psi[180]
+            return alpha, psi
+
+    dipping = Dipping()
+    depth_um = [dipping.depth_um(float(alpha)) for alpha in dipping._alpha]
+    assert np.all(np.diff(depth_um) >= 0)
+    assert dipping.depth_um(float(dipping._alpha[230])) == MODEL.depth_um(float(MODEL._alpha[199]))
+
+
 def test_the_models_contrast_is_the_exact_one() -> None:
     for alpha, psi, lp_per_mm in (
         (0.0, 0.0, 53.0),

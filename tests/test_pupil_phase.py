@@ -76,6 +76,11 @@ def test_the_phase_is_a_fraction_of_a_turn_and_loses_nothing_at_any_strength(
     assert difference_rad(turns, reference.pupil_phase(x, y, alpha, psi)) <= limit
 
 
+def test_a_phase_just_below_zero_wraps_into_the_turn(device: Device) -> None:
+    turns = PupilPhase(device, 1, 5).evaluate(Mask(-1e-8))
+    assert np.all((turns >= 0) & (turns < 1))
+
+
 @pytest.mark.parametrize("alpha", [1.0, 53.5, 1e3, 1e4, 1e5])
 def test_float32_holds_the_point_spread_function_to_3e_7_up_to_1e5(device: Device, alpha: float) -> None:
     n = 4096
