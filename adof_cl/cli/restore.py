@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _OUTLIER_SIGMAS = 10
 _OUTLIER_SHARE = 0.25
+_WIDE_PX = 25
 _OFFSET_PERCENTILE = 0.1
 
 
@@ -67,9 +68,9 @@ def restore(
     """Restore an image or a stack, page by page, each colour by itself.
 
     The blur is given by the mask and the object's depth (--alpha and --depth-um), or measured (--psf). A PSF
-    is normalised to unit sum. With it, isolated pixels that stand out from their 5 x 5 median by 10 sigma
-    and a quarter are replaced by it, and the image is padded to double size. Values beyond the file's range
-    are clipped.
+    is normalised to unit sum; with it the image is padded to double size, and if the PSF covers more than 25
+    pixels, single pixels that no such blur can leave, a quarter and 10 sigma away from their 5 x 5 median,
+    are replaced by it. Values beyond the file's range are clipped.
 
     Example: adof restore raw.tif hand.tif --psf psf.tif
     """
@@ -155,7 +156,6 @@ def _measured(
 
     from adof_cl.errors import InputError
     from adof_cl.image_files import read_image
-    from adof_cl.noise import noise_to_signal
     from adof_cl.restore import Restore
     from adof_cl.wiener import WienerFilter, psf_otf
 
@@ -170,17 +170,14 @@ def _measured(
         )
     first = next(iter(stack))
     dark = _dark_level(first) if level is None else level
-    light = _light(measured, _dark_level(measured) if level is None else level, repair=True)
+    light = np.maximum(_light(measured, _dark_level(measured) if level is None else level, repair=False), 0)
     plan = Restore(device, (rows, columns), precision=precision, padding=(rows, columns))
-    otf = psf_otf(np.maximum(light, 0), plan.padded_shape)
-    ratio: NDArray[np.float64] | float
-    if nsr is None:
-        ratio = noise_to_signal(_grey(_light(first, dark, repair=True)), otf, plan.padded_shape)
-    else:
-        ratio = nsr
+    otf = psf_otf(light, plan.padded_shape)
+    wide = float(light.sum(dtype=np.float64)) ** 2 > _WIDE_PX * float((light.astype(np.float64) ** 2).sum())
+    ratio = _ratio(nsr, _light(first, dark, wide), otf, plan.padded_shape)
     wiener = WienerFilter(device, plan.padded_shape, precision=precision)
     plan.set_filter(wiener.from_otf(otf, ratio))
-    return _Job(plan, dark, True, _described(ratio))
+    return _Job(plan, dark, wide, _described(ratio))
 
 
 def _computed(
@@ -197,7 +194,6 @@ def _computed(
 
     import numpy as np
 
-    from adof_cl.noise import noise_to_signal
     from adof_cl.optics import require_finite
     from adof_cl.otf import Otf1d
     from adof_cl.restore import Restore
@@ -212,20 +208,27 @@ def _computed(
         Otf1d(device, optics.frequency_axis(n), precision=precision).evaluate(mask.alpha_rad, psi)
         for n in plan.padded_shape
     ]
-    ratio: NDArray[np.float64] | float
     first = next(iter(stack))
     dark = _dark_level(first) if level is None else level
-    if nsr is None:
-        otf = np.outer(axes[0], axes[1][: plan.padded_shape[1] // 2 + 1])
-        ratio = noise_to_signal(_grey(_light(first, dark, repair=False)), otf, plan.padded_shape)
-    else:
-        ratio = nsr
+    otf = np.outer(axes[0], axes[1][: plan.padded_shape[1] // 2 + 1])
+    ratio = _ratio(nsr, _light(first, dark, repair=False), otf, plan.padded_shape)
     plan.set_filter_axes(axes[0], axes[1], ratio)
     return _Job(plan, dark, False, _described(ratio))
 
 
+def _ratio(
+    nsr: float | None, light: NDArray[np.float32], otf: NDArray[Any], padded: tuple[int, int]
+) -> NDArray[np.float64] | float:
+    """Return the noise-to-signal power given, else fit it to the first page."""
+    from adof_cl.noise import noise_to_signal
+
+    if nsr is not None:
+        return nsr
+    return noise_to_signal(light if light.ndim == 2 else light.mean(axis=2), otf, padded)
+
+
 def _light(page: Image, dark: float, repair: bool) -> NDArray[np.float32]:
-    """Return a page without the sensor's offset and, on request, without its isolated outliers."""
+    """Return a page without the sensor's offset and, on request, without single wild pixels."""
     import cv2
     import numpy as np
 
@@ -238,14 +241,10 @@ def _light(page: Image, dark: float, repair: bool) -> NDArray[np.float32]:
     return np.asarray(values - np.float32(dark), dtype=np.float32)
 
 
-def _grey(values: NDArray[np.float32]) -> NDArray[Any]:
-    return values if values.ndim == 2 else values.mean(axis=2)
-
-
 def _dark_level(page: Image) -> float:
     import numpy as np
 
-    return float(np.percentile(_light(page, 0.0, repair=True), _OFFSET_PERCENTILE))
+    return float(np.percentile(page, _OFFSET_PERCENTILE))
 
 
 def _codes(values: NDArray[Any], dtype: np.dtype[Any]) -> Image:
