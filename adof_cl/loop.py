@@ -175,7 +175,8 @@ class Options:
     iteration_limit: int = 600
 
 
-_FEATURES = (0, 2)  # opposite corners: whatever blurs a corner moves both alike about the part's middle
+# Opposite corners: whatever blurs a corner moves both alike about the part's middle.
+_DIAGONALS = ((0, 2), (1, 3))
 _GATE_UM = 900.0  # the peg's tip is 300 um under its face: above this depth nothing can touch
 _LOST_LIMIT = 12
 _TURN_RAD = 0.004  # a template 20 pixels wide turned by this is off by 0.04 at its rim
@@ -323,6 +324,7 @@ class Assembly:
         self._arm_at_rad = 0.0
         self._lost_in_a_row = 0
         self._last_move_um = np.zeros(3)
+        self._features: dict[str, tuple[int, int]] = {}
 
     # ---- the whole run ------------------------------------------------------------------------------------
 
@@ -424,11 +426,15 @@ class Assembly:
             expected = eye.seen[part].middle if known else eye.project(self.world[part])
             reach = 15.0 if known else 60.0 if eye.number == 1 else 30.0
             found = register(images[-1], drawing, eye.matrix[:, :2], expected_px=expected, reach_px=reach)
-            corners = found.pixels(self._design_of(part).corners_um[list(_FEATURES)])
-            self._keep_templates(eye, part, images[-1], corners)
             if eye.number == 1:
                 middle = np.linalg.solve(eye.matrix[:, :2], found.origin_px - eye.origin)
                 self.world[part] = np.array([*middle, self.world[part][2]])
+                if part not in eye.seen:
+                    # The peg may stand in front of one corner of the hole: never of both on this diagonal.
+                    aside = self.world[HOLE] - self.world[PEG]
+                    self._features[part] = _DIAGONALS[int(part == HOLE and aside[0] * aside[1] > 0)]
+            corners = found.pixels(self._design_of(part).corners_um[list(self._features[part])])
+            self._keep_templates(eye, part, images[-1], corners)
         self._tell("templates", f"{part}: features taken in focus")
 
     def _design_of(self, part: str) -> PartDesign:
@@ -797,11 +803,10 @@ class Assembly:
 
     def _desired(self, block: Array, peg: Features) -> Array:
         """Return where the hole's corners belong: around the peg's middle, turned as the peg is."""
-        features = list(_FEATURES)
-        drawn = self.design.peg.corners_um[features]
+        drawn = self.design.peg.corners_um[list(self._features[PEG])]
         turn = _turn_between(drawn[1] - drawn[0], np.linalg.solve(block, peg.xy_px[1] - peg.xy_px[0]))
         c, s = math.cos(turn), math.sin(turn)
-        corners = self.design.hole.corners_um[features] @ np.array([[c, s], [-s, c]])
+        corners = self.design.hole.corners_um[list(self._features[HOLE])] @ np.array([[c, s], [-s, c]])
         return np.asarray(peg.middle + corners @ block.T)
 
     def _note(self, stage: str, sight: _Sight, wanted_um: float, velocity: Array, compute_ms: float) -> None:
