@@ -27,7 +27,7 @@
 //   m
 //   scale      real           1/(m^2 sum amplitude^2): the psf sums to 1
 //
-// Error: relative L2 of the psf below 5e-7 in float, 1e-15 in double, at m = 1024 (PoCL).
+// Error: relative L2 of the psf below 5e-7 in float, 2e-15 in double, at m = 1024 (PoCL, Intel).
 
 // phase_turns.h first: it forbids contraction, so that psf_intensity's imaginary parts cancel.
 #include "phase_turns.h"
