@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from adof_cl.autofocus import focus_sweep
 from adof_cl.device import Device
 from adof_cl.errors import AdofError, TrackingError
-from adof_cl.mask import Calibration, ModelCalibration, PaperCalibration, choose_mask
+from adof_cl.mask import ModelCalibration, PaperCalibration, choose_mask
 from adof_cl.optics import Mask, OpticalSystem, SlmPanel
 from adof_cl.pipeline import Blur, CameraPipeline
 from adof_cl.record import Iteration, Position, RunRecord
@@ -309,9 +309,8 @@ class Assembly:
             _Eye(1, rig.camera_1, device, design, self.options.nsr),
             _Eye(2, rig.camera_2, device, design, self.options.nsr),
         )
-        self._calibration: Calibration = (
-            PaperCalibration() if self.options.mask == "paper" else ModelCalibration(design.optics_1)
-        )
+        self._model = ModelCalibration(design.optics_1)
+        self._calibration = PaperCalibration()
         self.world: dict[str, Array] = {PEG: np.zeros(3), HOLE: np.zeros(3)}
         """Where the parts are, as well as known: camera 1's axes, z the depth from its plane in focus."""
         self.stereo: StereoRig | None = None
@@ -329,15 +328,19 @@ class Assembly:
     # ---- the whole run ------------------------------------------------------------------------------------
 
     def run(self) -> RunRecord:
-        """Do the assembly; the stages are at rest when it returns or raises."""
+        """Do all of it; the stages are at rest when it returns or raises."""
         with self.stages_stopped_afterwards():
             self.prepare()
-            for stage, carry_out in (("coarse", self.coarse), ("fine", self.fine), ("insert", self.insert)):
-                carry_out()
-                self._reached(stage)
-            self.record.docked = True
-            self.record.end_state = "docked"
+            self.assemble()
         return self.record
+
+    def assemble(self) -> None:
+        """Dock, from wherever the hole is: coarse, fine, insertion."""
+        for stage, carry_out in (("coarse", self.coarse), ("fine", self.fine), ("insert", self.insert)):
+            carry_out()
+            self._reached(stage)
+        self.record.docked = True
+        self.record.end_state = "docked"
 
     @contextmanager
     def stages_stopped_afterwards(self) -> Iterator[None]:
@@ -388,10 +391,14 @@ class Assembly:
         """Choose the mask for a depth range by the operator's rule."""
         if self.options.mask == "fixed":
             return Mask(self.options.fixed_alpha_rad)
-        optics = self.design.optics_1
         if self.options.mask == "paper":
-            return choose_mask(near_um, far_um, self._calibration, optics)
-        mask = choose_mask(near_um, far_um, self._calibration, optics, joint=True)
+            return choose_mask(near_um, far_um, self._calibration, self.design.optics_1)
+        return self.joint_mask(near_um, far_um)
+
+    def joint_mask(self, near_um: float, far_um: float) -> Mask:
+        """Choose cubic and focus together, the focus at the middle of the depth range."""
+        optics = self.design.optics_1
+        mask = choose_mask(near_um, far_um, self._model, optics, joint=True)
         # The criterion keeps a line pattern visible; tracking wants the whole band of the sensor, which lies
         # within |u| < 2 (1 - |psi| / (3 alpha)): docs/maths.md, eq. O6.
         defocus = max(abs(mask.psi_rad(optics, near_um)), abs(mask.psi_rad(optics, far_um)))
@@ -489,7 +496,7 @@ class Assembly:
             self._tell("calibration", f"plane {number + 1} of {len(planes)}, {plane:.0f} µm deep")
             for dx, dy in steps:
                 there = {"x": middle[0] + dx, "y": middle[1] + dy, "z": start["z"] + plane - depth}
-                seen = self._hole_at(there)
+                seen = self.move_hole(there)
                 if any(features.lost or features.bent_px(eye.taught[HOLE]) > _BENT_PX
                        for features, eye in zip(seen, self.eyes, strict=True)):  # fmt: skip
                     hidden += 1
@@ -499,7 +506,7 @@ class Assembly:
                 for k, features in enumerate(seen):
                     pixels[k].append(features.middle)
                     covariances[k].append(features.middle_covariance)
-        self._hole_at({axis: start[axis] for axis in ("x", "y", "z")})
+        self.move_hole({axis: start[axis] for axis in ("x", "y", "z")})
         volume = np.array(
             [
                 [start["x"] - 600, start["y"] - 600, start["z"] - depth],
@@ -527,7 +534,7 @@ class Assembly:
         self._learn_rotation(start)
         self._learn_fine_stage()
 
-    def _hole_at(self, there: Mapping[str, float]) -> tuple[Features, Features]:
+    def move_hole(self, there: Mapping[str, float]) -> tuple[Features, Features]:
         """Move the hole, focus on it, and measure it in both cameras."""
         before = self._hole_world()
         self.rig.coarse.move_to(there)
@@ -535,6 +542,7 @@ class Assembly:
         world = self._hole_world()
         self.world[HOLE] = world
         self.show(self.focused(float(world[2])))
+        self._turn_templates()
         frames = self.look()
         found = []
         for eye, frame in zip(self.eyes, frames, strict=True):
@@ -553,7 +561,7 @@ class Assembly:
         camera = self.stereo.camera_1
         before = self.eyes[0].seen[HOLE].middle
         angle = -math.copysign(0.03, start["theta"]) if start["theta"] else 0.03
-        after = self._hole_at({"theta": start["theta"] + angle})[0].middle
+        after = self.move_hole({"theta": start["theta"] + angle})[0].middle
         turned = self.rig.coarse.position()["theta"] - start["theta"]
         moved = camera.motion_um((after - before)[None])[0]
         jog_test([[turned]], [[self._seen_turn()]])
@@ -561,7 +569,7 @@ class Assembly:
         # moved = (R - 1) arm, with the arm from the rotation's centre to the hole's middle.
         self._rotation_arm_um = np.linalg.solve(np.array([[c - 1, -s], [s, c - 1]]), moved)
         self._arm_at_rad = start["theta"]
-        self._hole_at({"theta": start["theta"]})
+        self.move_hole({"theta": start["theta"]})
 
     def _seen_turn(self) -> float:
         """Return how far camera 1 sees the hole turned since its templates were taken."""
@@ -598,6 +606,19 @@ class Assembly:
         observed = self.stereo.camera_1.motion_um(60.0 * np.stack(columns))
         jog_test(60.0 * np.eye(2), observed)
         peg_middle()
+
+    def bring_hole_to(self, depth_um: float) -> None:
+        """Put the hole under the peg, aligned, so far below the peg's face: for surveys, not for docking."""
+        self._target = dict(self.rig.coarse.position())
+        self._last_move_um = np.zeros(3)
+        for _ in range(5):
+            self.show(self._next_mask())
+            sight = self._see()
+            self._move(np.array([*sight.error_um, sight.error_rad, depth_um - sight.depth_um]))
+            self.rig.coarse.wait_until_still()
+        self.show(self._next_mask())
+        self._see()
+        self._last_move_um = np.zeros(3)
 
     # ---- the loop -----------------------------------------------------------------------------------------
 

@@ -102,6 +102,19 @@ class CameraPipeline:
             self.device, self.shape, templates, self._search_shape, limits=limits
         )
 
+    def templates(self, part: str) -> list[Template]:
+        """Return the features of `part` that are followed now.
+
+        Raises
+        ------
+        TrackingError
+            None have been set.
+        """
+        self._require_part(part)
+        if part not in self._trackers:
+            raise TrackingError(f"part '{part}' has no templates: set_templates first")
+        return list(self._trackers[part].templates)
+
     def __call__(
         self,
         frame: Pixels,
@@ -126,9 +139,7 @@ class CameraPipeline:
             A part without templates.
         """
         for part in blurs:
-            self._require_part(part)
-            if part not in self._trackers:
-                raise TrackingError(f"part '{part}' has no templates: set_templates first")
+            self.templates(part)
         self._enqueue(frame, blurs)
         for part, blur in blurs.items():
             tracker = self._trackers[part]

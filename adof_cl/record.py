@@ -104,6 +104,7 @@ class RunRecord:
     end_state: str = "not started"
     docked: bool = False
     coarse_error: dict[str, float] = field(default_factory=dict)
+    fine_error: dict[str, float] = field(default_factory=dict)
     final_error: dict[str, float] = field(default_factory=dict)
     contacts: int = 0
     wall_s: float = math.nan
@@ -119,6 +120,7 @@ class RunRecord:
             "final_error_rad": self.final_error.get("theta"),
             "coarse_error_um": {axis: self.coarse_error.get(axis) for axis in ("x", "y", "z")},
             "coarse_error_rad": self.coarse_error.get("theta"),
+            "fine_error_um": {axis: self.fine_error.get(axis) for axis in ("x", "y", "z")},
             "contacts_before_alignment": self.contacts,
             "iterations": len(self.iterations),
             "compute_ms": {k: float(np.percentile(times, q)) if times else None for k, q in quantile.items()},

@@ -1,0 +1,290 @@
+"""`adof run`: the whole assembly, on the twin."""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from adof_cl.cli.devices import DeviceOption
+from adof_cl.errors import AdofError, InputError
+
+if TYPE_CHECKING:
+    from adof_cl.record import Iteration, RunRecord
+    from adof_cl.survey import ArmResult
+    from adof_cl.twin import Twin
+
+MASKS = ("joint", "paper", "fixed")
+
+
+def run(
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, help="Draws the start, the rig's hidden errors and all noise.")
+    ] = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Run folder, new or empty; default: runs/TIME-seed-N."),
+    ] = None,
+    mask: Annotated[
+        str, typer.Option("--mask", help="joint: cubic and focus chosen together; paper: Eq. 4; fixed.")
+    ] = "joint",
+    compare: Annotated[
+        bool, typer.Option("--compare", help="First measure every arm of the paper's Tables 2 and 3.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print metrics.json at the end.")] = False,
+    device: DeviceOption = None,
+) -> None:
+    """Assemble peg and hole on the twin: autofocus, templates, calibration, coarse, fine, insertion.
+
+    Writes metrics.json, iterations.json, figures and report.html (one file, opens without a server). Exits 0
+    when docked, 1 when the run ended otherwise, 130 on Ctrl-C; the folder is complete up to that moment.
+
+    Examples: adof run | adof run --seed 7 --out seven --compare | ADOF_DEVICE=cpu adof run --json
+    """
+    if mask not in MASKS:
+        raise InputError(f"mask is '{mask}': choose one of {', '.join(MASKS)}")
+
+    from adof_cl import twin as twins
+    from adof_cl.cli.progress import Live
+    from adof_cl.device import Device
+    from adof_cl.loop import HOLE, PEG, PEG_OVER_HOLE, Assembly, Options
+    from adof_cl.record import RunRecord, finite_json
+    from adof_cl.survey import survey
+    from adof_cl.twin.parts import drawing_of
+
+    opened = Device.open(device)
+    folder = _folder(out, seed)
+    begun = time.perf_counter()
+    twin = twins.build(seed)
+    for camera in (twin.camera_1, twin.camera_2):
+        camera.set_centred_region()
+    record = RunRecord(seed, str(opened.facts))
+    truth = Truth(twin, record)
+    arms: list[ArmResult] = []
+    refusal = ""
+    try:
+        with Live(f"adof run, seed {seed}, {opened.facts}") as live:
+            live.tell("start", "kernels are compiled once for each device, which takes seconds")
+            drawings = {
+                PEG: drawing_of(twin.design.peg),
+                PEG_OVER_HOLE: drawing_of(twin.design.peg, over_hole=True),
+                HOLE: drawing_of(twin.design.hole),
+            }
+            assembly = Assembly(
+                opened,
+                twin,
+                twin.design,
+                drawings,
+                record,
+                options=Options(mask=mask),
+                progress=live.tell,
+                observer=truth.observe,
+                milestone=truth.reached,
+            )
+            with assembly.stages_stopped_afterwards():
+                assembly.prepare()
+                if compare:
+                    arms = survey(assembly, truth.hole_px, progress=live.tell)
+                assembly.assemble()
+    except AdofError as failure:
+        refusal = str(failure)
+    finally:
+        record.wall_s = time.perf_counter() - begun
+        truth.finish()
+        _write(folder, record, arms)
+    if as_json:
+        print(json.dumps(finite_json(record.metrics()), indent=2))
+    else:
+        _print_summary(record, arms, folder)
+    if refusal:
+        print(f"adof: {refusal}", file=sys.stderr)
+    if not record.docked:
+        raise typer.Exit(1)
+
+
+class Truth:
+    """Adds to the record what only the twin's world knows; the loop never sees it."""
+
+    def __init__(self, twin: Twin, record: RunRecord) -> None:
+        self._twin = twin
+        self._record = record
+        self._origin_xy = np.array(twin.design.region_origin_yx[::-1], dtype=np.float64)
+
+    def hole_px(self, time_s: float) -> NDArray[np.float64]:
+        """Return where the hole's middle is seen by camera 1, region of interest, (x, y)."""
+        corners = self._twin.world.corners_px(1, HOLE_NAME, time_s)
+        return np.asarray(corners.mean(axis=0) - self._origin_xy)
+
+    def observe(self, iteration: Iteration, time_s: float) -> Iteration:
+        """Fill in one iteration's truth."""
+        truth = self._twin.world.truth(time_s)
+        bias = np.array(iteration.hole_xy_px) - self.hole_px(time_s)
+        return dataclasses.replace(
+            iteration,
+            hole_bias_px=(float(bias[0]), float(bias[1])),
+            true_error_x_um=truth.offset_um[0],
+            true_error_y_um=truth.offset_um[1],
+            true_error_theta_rad=truth.offset_rad,
+            true_depth_um=truth.depth_um,
+            true_hole_xyz_um=(truth.hole.x_um, truth.hole.y_um, truth.hole.z_um),
+        )
+
+    def reached(self, stage: str) -> None:
+        """Keep the error at the end of a stage."""
+        errors = self._errors()
+        if stage == "coarse":
+            self._record.coarse_error = errors
+        elif stage == "fine":
+            self._record.fine_error = errors
+
+    def finish(self) -> None:
+        """Keep the errors and contacts at the end of the run."""
+        self._record.final_error = self._errors()
+        self._record.contacts = len(self._twin.world.contacts)
+        if self._record.contacts:
+            self._record.docked = False
+            self._record.end_state += "; the parts touched"
+
+    def _errors(self) -> dict[str, float]:
+        from adof_cl.loop import Options
+
+        truth = self._twin.world.truth()
+        stage = self._record.iterations[-1].stage if self._record.iterations else "coarse"
+        wanted = Options().seat_um if stage == "insert" else Options().stand_off_um
+        return {
+            "x": truth.offset_um[0],
+            "y": truth.offset_um[1],
+            "z": truth.depth_um - wanted,
+            "theta": truth.offset_rad,
+        }
+
+
+HOLE_NAME = "hole"
+
+
+def _folder(out: Path | None, seed: int) -> Path:
+    folder = out or Path("runs") / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-seed-{seed}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise InputError(f"{folder} already holds files: choose a new or empty folder")
+        probe = folder / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as failure:
+        raise InputError(
+            f"{folder} cannot be written ({failure.strerror}): choose another folder"
+        ) from failure
+    return folder
+
+
+def _write(folder: Path, record: RunRecord, arms: Sequence[ArmResult]) -> None:
+    from adof_cl.files import whole_file
+    from adof_cl.record import finite_json, write_metrics
+    from adof_cl.report import write_report
+
+    write_metrics(record, folder)
+    extra = ""
+    if arms:
+        with whole_file(folder / "compare.json") as temporary:
+            rows = [finite_json(arm.as_dict()) for arm in arms]
+            temporary.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+        extra = f"<h2>Tables 2 and 3, every column</h2><pre>{html.escape(comparison(arms))}</pre>"
+    write_report(record, folder, extra)
+
+
+def comparison(arms: Sequence[ArmResult]) -> str:
+    """Return the paper's Tables 2 and 3 with all columns, and the error that the score does not show."""
+    from adof_cl.survey import ARMS, PAPER_HOLE, PAPER_PEG
+
+    positions = list(dict.fromkeys(arm.position for arm in arms))
+    of = {(arm.position, arm.arm.name): arm for arm in arms}
+    depth = {arm.position: arm.depth_um for arm in arms}
+    heads = [
+        "no mask",
+        "fixed 80 focus",
+        "fixed 80 own",
+        "adaptive focus",
+        "adaptive own",
+        "ours",
+    ]
+
+    def table(title: str, cell: str, paper: dict[str, dict[str, float]]) -> list[str]:
+        head = f"{'':3}{'depth':>6}" + "".join(f"{h:>16}" for h in heads)
+        head += "".join(f"{'paper ' + name:>16}" for name in paper)
+        lines = [title, head]
+        for p in positions:
+            line = f"{p:3}{depth[p]:6.0f}"
+            line += "".join(f"{getattr(of[p, arm.name], cell):16.2f}" for arm in ARMS)
+            line += "".join(f"{_or_dash(column.get(p)):>16}" for column in paper.values())
+            lines.append(line)
+        return [*lines, ""]
+
+    lines = table(
+        "Table 2. Minimum SSD on the hole (sum over 20 x 20 pixels, grey in [0, 1])",
+        "ssd_hole",
+        {"adaptive": dict(PAPER_HOLE["adaptive"]), "none": dict(PAPER_HOLE["none"])},
+    )
+    lines += table(
+        "Table 3. Minimum SSD on the peg",
+        "ssd_peg",
+        {"adaptive": dict(PAPER_PEG["adaptive"]), "fixed": dict(PAPER_PEG["fixed"])},
+    )
+    lines.append(
+        "What the SSD does not show: where the hole was measured less where it is, px along x and y,"
+    )
+    lines.append("and in brackets the shift predicted for that filter (* : |psi|/(3 alpha) of 0.5 or more)")
+    lines.append(f"{'':3}{'depth':>6}" + "".join(f"{h:>24}" for h in heads))
+    for p in positions:
+        line = f"{p:3}{depth[p]:6.0f}"
+        for arm in ARMS:
+            result = of[p, arm.name]
+            star = "*" if result.defocus_share >= 0.5 else ""
+            predicted = f" ({result.predicted_shift_px:.2f}{star})" if arm.filter == "focus" else ""
+            line += f"{f'{result.bias_px[0]:.2f} {result.bias_px[1]:.2f}{predicted}':>24}"
+        lines.append(line)
+    lost = ", ".join(f"{a.position} {a.arm.name}" for a in arms if a.lost)
+    lines.append(f"A run would have refused features at: {lost or 'none'}.")
+    return "\n".join(lines)
+
+
+def _or_dash(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _print_summary(record: RunRecord, arms: Sequence[ArmResult], folder: Path) -> None:
+    metrics = record.metrics()
+    if arms:
+        print(comparison(arms) + "\n")
+    print(f"{record.end_state} after {len(record.iterations)} iterations, {record.wall_s:.1f} s")
+    for title, errors in (
+        ("coarse", record.coarse_error),
+        ("fine", record.fine_error),
+        ("final", record.final_error),
+    ):
+        if errors:
+            print(
+                f"{title:>7}: x {errors['x']:+.2f}  y {errors['y']:+.2f}  z {errors['z']:+.2f} µm  "
+                f"θ {1e3 * errors['theta']:+.2f} mrad off"
+            )
+    for p in record.positions:
+        print(
+            f"      {p.name}: depth {p.depth_um:6.1f} µm, estimated {p.depth_est_um:6.1f}, α {p.alpha:5.2f}, "
+            f"SSD hole {p.ssd_hole:.2f} peg {p.ssd_peg:.2f}, "
+            f"bias {p.lateral_bias_um[0]:+.2f} {p.lateral_bias_um[1]:+.2f} µm"
+        )
+    compute = metrics["compute_ms"]
+    if compute["p50"] is not None and math.isfinite(compute["p50"]):
+        print(f"compute: {compute['p50']:.1f} ms median, {compute['p99']:.1f} ms p99 per iteration")
+    print(f"report: {folder / 'report.html'}")
