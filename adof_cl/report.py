@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adof_cl.files import whole_file
 from adof_cl.record import RunRecord, finite_json
@@ -52,8 +53,9 @@ def _trajectory(record: RunRecord) -> Figure:
     from_above.set(xlabel="x (µm)", ylabel="y (µm)", title="Hole seen along the optical axis", aspect="equal")
     from_above.invert_yaxis()
     from_above.legend()
+    true_depth = np.array([i.true_depth_um for i in record.iterations])
     for axis, name in ((0, "x"), (1, "y")):
-        over_depth.plot(path[:, axis], path[:, 2], lw=1.2, label=f"{name}, true")
+        over_depth.plot(path[:, axis], true_depth, lw=1.2, label=f"{name}, true")
         over_depth.plot(path[:, axis], depth, ".", ms=2.5, color=f"C{axis}", alpha=0.5)
     over_depth.set(
         xlabel="lateral (µm)", ylabel="depth (µm)", title="Hole from the side; dots: estimated depth"
@@ -70,7 +72,7 @@ def _trajectory(record: RunRecord) -> Figure:
 
 def _mask_and_depth(record: RunRecord) -> Figure:
     figure = _figure(10, 6.4)
-    time = np.array([i.time_s for i in record.iterations])
+    time = _time(record)
     mask, depth = figure.subplots(2, 1, sharex=True)
     mask.step(time, [i.alpha_rad for i in record.iterations], where="post", label="cubic α")
     mask.step(time, [i.focus_psi_rad for i in record.iterations], where="post", label="focus ψ")
@@ -81,7 +83,7 @@ def _mask_and_depth(record: RunRecord) -> Figure:
     truth = np.array([i.true_depth_um for i in record.iterations])
     depth.plot(time, truth, "k-", lw=0.8, label="true depth")
     depth.plot(time, estimated, ".", ms=3, label="estimated")
-    depth.set(ylabel="depth (µm)", xlabel="time (s)")
+    depth.set(ylabel="depth (µm)", xlabel="time since the first frame (s)")
     error = depth.twinx()
     error.errorbar(time, estimated - truth, yerr=sigma, fmt=".", ms=2, lw=0.6, color="C1", label="error ± σ")
     limit = (
@@ -97,7 +99,7 @@ def _mask_and_depth(record: RunRecord) -> Figure:
 
 def _servo_errors(record: RunRecord) -> Figure:
     figure = _figure(10, 6.4)
-    time = np.array([i.time_s for i in record.iterations])
+    time = _time(record)
     position, angle = figure.subplots(2, 1, sharex=True)
     for name in ("x", "y", "z"):
         values = np.abs([getattr(i, f"error_{name}_um") for i in record.iterations])
@@ -112,16 +114,22 @@ def _servo_errors(record: RunRecord) -> Figure:
     )
     true_angle = np.abs([i.true_error_theta_rad for i in record.iterations])
     angle.semilogy(time, np.maximum(true_angle, 1e-6), ":", color="C0", label="|θ| true")
-    angle.set(ylabel="error (rad)", xlabel="time (s)")
+    angle.set(ylabel="error (rad)", xlabel="time since the first frame (s)")
     angle.legend()
     previous = ""
-    for iteration in record.iterations:
+    for at_s, iteration in zip(time, record.iterations, strict=True):
         if iteration.stage != previous:
             previous = iteration.stage
             for axes in (position, angle):
-                axes.axvline(iteration.time_s, color="0.7", lw=0.8)
-            position.text(iteration.time_s, position.get_ylim()[1], f" {previous}", va="top", fontsize=9)
+                axes.axvline(at_s, color="0.7", lw=0.8)
+            top = position.get_ylim()[1]
+            position.text(at_s, top, f"{previous} ", va="top", ha="right", rotation=90, fontsize=9)
     return figure
+
+
+def _time(record: RunRecord) -> NDArray[np.float64]:
+    """Seconds since the loop's first frame."""
+    return np.array([i.time_s - record.iterations[0].time_s for i in record.iterations])
 
 
 def _frames(record: RunRecord) -> Figure:
