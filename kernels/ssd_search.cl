@@ -670,26 +670,27 @@ void ssd_search_best(
 #endif
 
     const int y = smallest_at / offset_columns;
-    const int x = smallest_at % offset_columns;
+    const int x = smallest_at - y * offset_columns;
     const int top = origins[2 * index] + y;
     const int left = origins[2 * index + 1] + x;
     __global int *record = records + index * RECORD;
     if (item == 0) {
         record[0] = top;
         record[1] = left;
-        for (int i = 0; i < 9; ++i) {
-            const int ny = y + i / 3 - 1;
-            const int nx = x + i % 3 - 1;
-            const int inside = ny >= 0 && ny < offset_rows && nx >= 0 && nx < offset_columns;
-            record[2 + i] = inside ? scores[(index * offset_rows + ny) * offset_columns + nx] : SCORE_NONE;
+        for (int ny = y - 1; ny <= y + 1; ++ny) {
+            for (int nx = x - 1; nx <= x + 1; ++nx) {
+                const int inside = ny >= 0 && ny < offset_rows && nx >= 0 && nx < offset_columns;
+                record[2 + 3 * (ny - y + 1) + nx - x + 1] =
+                    inside ? scores[(index * offset_rows + ny) * offset_columns + nx] : SCORE_NONE;
+            }
         }
     }
 #if PATCH_ROWS > 0
     // Beyond the image's edge the patch repeats the last pixel.
-    for (int i = item; i < PATCH_ROWS * PATCH_COLUMNS; i += BEST_ITEMS) {
-        const int py = clamp(top - PATCH_MARGIN + i / PATCH_COLUMNS, 0, image_rows - 1);
-        const int px = clamp(left - PATCH_MARGIN + i % PATCH_COLUMNS, 0, image_columns - 1);
-        record[11 + i] = as_int((float)image[py * image_columns + px]);
+    for (int r = 0; r < PATCH_ROWS; ++r) {
+        __global const pixel *from = image + clamp(top - PATCH_MARGIN + r, 0, image_rows - 1) * image_columns;
+        for (int c = item; c < PATCH_COLUMNS; c += BEST_ITEMS)
+            record[11 + r * PATCH_COLUMNS + c] = as_int((float)from[clamp(left - PATCH_MARGIN + c, 0, image_columns - 1)]);
     }
 #endif
 }
