@@ -57,6 +57,11 @@ def phase_rad(precision: str) -> float:
 # ---- search -----------------------------------------------------------------------------------------------
 
 
+def image_prep_real(frame: np.ndarray, dark: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """Absolute limit of gain (frame - dark) in float32: dark, gain, difference and product each round once."""
+    return 2 * eps("float32") * gain * (frame + np.abs(dark)) + 1e-30
+
+
 def ssd_relative(rows: int, columns: int) -> float:
     """Relative limit of a float32 SSD (docs/maths.md, eq. S4): terms of one sign, summed row by row."""
     return eps("float32") * (rows + columns + 2) / 2
