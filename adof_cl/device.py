@@ -166,7 +166,8 @@ def choose(devices: Sequence[DeviceFacts], selector: str | None = None) -> Devic
     else:
         # PoCL's platform spells its name out; only its version string says "PoCL".
         fits = [d for d in devices if wanted in f"{d.name} {d.platform} {d.version}".lower()]
-        fits.sort(key=lambda d: d.simulated)
+        # A CPU's own name may hold its maker's: the platform of that name comes first.
+        fits.sort(key=lambda d: (d.simulated, wanted not in d.platform.lower()))
     if fits:
         return fits[0]
     listing = "; ".join(f"{d.index}: {d}" for d in devices) or "none"

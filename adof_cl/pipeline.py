@@ -22,6 +22,11 @@ from adof_cl.tracking import Measurement, Template, TemplateTracker, TrackingLim
 Pixels = NDArray[np.uint8]
 
 
+# A filter is formed anew when alpha or psi moved by more: within |psi| < 3 |alpha| the image shifts by at
+# most 2 x 0.154 px per radian of either (docs/maths.md, eq. O7), here 0.003 px.
+_SAME_RAD = 0.01
+
+
 @dataclass(frozen=True)
 class Blur:
     """What blurred one part in one frame: its filter is exact for exactly this."""
@@ -34,6 +39,14 @@ class Blur:
         """Return the blur of a part at `depth_um` seen through `mask`."""
         require_finite(depth_um=depth_um)
         return cls(mask.alpha_rad, mask.psi_rad(optics, depth_um))
+
+    def near(self, other: Blur | None) -> bool:
+        """Whether the other's filter serves this blur as well."""
+        return (
+            other is not None
+            and abs(self.alpha_rad - other.alpha_rad) <= _SAME_RAD
+            and abs(self.psi_rad - other.psi_rad) <= _SAME_RAD
+        )
 
 
 class CameraPipeline:
@@ -67,7 +80,7 @@ class CameraPipeline:
         parts: Sequence[str],
         *,
         nsr: float = 0.01,
-        padding: int = 100,
+        padding: int = 64,
         search_shape: tuple[int, int] = (64, 64),
     ) -> None:
         self.device = device
@@ -79,12 +92,18 @@ class CameraPipeline:
         self._restore = Restore(device, shape, in_dtype=np.uint8, out_dtype=np.uint8, padding=padding)
         rows, columns = self._restore.padded_shape
         # The pixel's own transfer stays in the image, as it is in the templates.
-        self._otf_rows = Otf1d(device, optics.frequency_axis(rows), pairs=len(self.parts))
-        self._otf_columns = Otf1d(device, optics.frequency_axis(columns), pairs=len(self.parts))
+        self._otf = {
+            part: (
+                Otf1d(device, optics.frequency_axis(rows)),
+                Otf1d(device, optics.frequency_axis(columns)),
+            )
+            for part in self.parts
+        }
         self._frame = device.empty(shape, np.uint8)
         self._images = {part: device.empty(shape, np.uint8) for part in self.parts}
         self._trackers: dict[str, TemplateTracker] = {}
         self._blurs: dict[str, Blur] = {}
+        self._restored: list[str] = []
 
     def set_templates(
         self, part: str, templates: Sequence[Template], limits: TrackingLimits | None = None
@@ -154,26 +173,21 @@ class CameraPipeline:
 
     def last_images(self) -> dict[str, Pixels]:
         """Return what the last frame was restored to, for each part it was restored for."""
-        return {part: self._images[part].download() for part in self._blurs}
+        return {part: self._images[part].download() for part in self._restored}
 
     def _enqueue(self, frame: Pixels, blurs: Mapping[str, Blur | None]) -> None:
         self._frame.upload(frame)
-        wanted = {part: blur for part, blur in blurs.items() if blur is not None}
-        pairs = np.zeros((len(self.parts), 2))
-        for index, part in enumerate(self.parts):
-            blur = wanted.get(part)
-            if blur is not None:
-                pairs[index] = blur.alpha_rad, blur.psi_rad
-        if wanted and wanted != {part: self._blurs.get(part) for part in wanted}:
-            h_rows, h_columns = self._otf_rows(pairs), self._otf_columns(pairs)
-            for part in wanted:
-                slot = self.parts.index(part)
-                self._restore.set_filter_axes_device(
-                    h_rows, h_columns, self.nsr, slot, row_entry=slot, col_entry=slot
-                )
-        for part in wanted:
-            self._restore(self._frame, self._images[part], self.parts.index(part))
-        self._blurs = wanted
+        self._restored = [part for part, blur in blurs.items() if blur is not None]
+        for part, blur in blurs.items():
+            if blur is None:
+                continue
+            slot = self.parts.index(part)
+            if not blur.near(self._blurs.get(part)):
+                pair = [(blur.alpha_rad, blur.psi_rad)]
+                h_rows, h_columns = (plan(pair) for plan in self._otf[part])
+                self._restore.set_filter_axes_device(h_rows, h_columns, self.nsr, slot)
+                self._blurs[part] = blur
+            self._restore(self._frame, self._images[part], slot)
 
     def _require_part(self, part: str) -> None:
         if part not in self.parts:

@@ -27,7 +27,7 @@ from adof_cl.errors import BuildError, DeviceError, InputError
 CACHE_VARIABLE = "ADOF_CACHE_DIR"
 
 _MAGIC = b"adof-cl program 1\n"
-_INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]+"([^"]+)"[ \t]*$', re.MULTILINE)
+_INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]+"([^"]+)"[^\n]*$', re.MULTILINE)
 
 Argument = DeviceArray | np.generic | None
 """What a kernel takes: an array on the device, a NumPy scalar of the exact type, or None for no buffer."""

@@ -119,10 +119,10 @@ def survey(
     """
     tell = progress or (lambda _stage, _sentence: None)
     eye = assembly.eyes[0]
-    # Its own pipeline: a window wide enough for the largest displacement, and no feature refused.
+    # Its own pipeline: room for the widest blur and the largest displacement, and no feature refused.
     pipeline = CameraPipeline(
         eye.pipeline.device, eye.optics, eye.pipeline.shape, (PEG, HOLE), nsr=eye.pipeline.nsr,
-        search_shape=(84, 84),
+        padding=100, search_shape=(84, 84),
     )  # fmt: skip
     anything = TrackingLimits(mismatch=1.1, sigma_px=1e3, gain=(1e-6, 1e6))
     usual = TrackingLimits(mismatch=0.7)

@@ -70,6 +70,12 @@ def test_a_selector_picks_what_it_names_or_is_refused_with_the_list(selector: st
             choose(FOUND, selector)
 
 
+def test_a_platforms_name_counts_before_a_processors() -> None:
+    pocl_on_a_vendors_cpu = facts(0, "pthread-Vendor Xeon", "Portable Computing Language", "cpu")
+    the_vendors = facts(1, "Xeon", "Vendor OpenCL", "cpu")
+    assert choose([pocl_on_a_vendors_cpu, the_vendors], "vendor") == the_vendors
+
+
 def test_every_index_of_the_listing_names_its_own_device() -> None:
     devices = list_devices()
     assert [choose(devices, str(d.index)).index for d in devices] == list(range(len(devices)))

@@ -13,7 +13,7 @@ from adof_cl.errors import BuildError, InputError
 from adof_cl.program import Program
 
 SQUARE = """
-#include "complex.h"
+#include "complex.h"   // a comment here must not hide the header
 __kernel void square(__global cplx *values)
 {
     const int i = get_global_id(0);
