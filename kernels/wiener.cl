@@ -53,9 +53,11 @@ static inline __attribute__((always_inline)) void wiener_level(real *level, __gl
                                                                const real nsr, const size_t start,
                                                                const int held)
 {
-    for (int i = 0; i < WIENER_RUN; ++i) level[i] = nsr;
+    // Not a loop up to `held`: Intel's runtime 2026.2 then reads one element further on where the run is 1.
     if (noise)
-        for (int i = 0; i < held; ++i) level[i] = noise[start + i];
+        for (int i = 0; i < WIENER_RUN; ++i) level[i] = i < held ? noise[start + i] : 0;
+    else
+        for (int i = 0; i < WIENER_RUN; ++i) level[i] = nsr;
 }
 
 static inline __attribute__((always_inline)) void wiener_put(__global real *filter, const wiener_run *g,
