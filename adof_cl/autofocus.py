@@ -25,6 +25,9 @@ _CLIPPED = 0.02  # share of pixels at full scale above which the sharpness is of
 _BLACKEST = 0.01  # mean grey, of full scale, below which there is no light to focus
 _NEAR_PEAK = 0.6  # the share of the peak's height above which its logarithm is a parabola
 _LEAST_RISE = 5.0  # the peak over the curve's floor, in standard deviations of a score
+_LEAST_CONTRAST = (
+    0.1  # and as a share of the peak: a weak cubic mask leaves up to 0.06, with its peak anywhere
+)
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,7 @@ def focus_sweep(
     again = [score(positions[top]) for _ in range(2)]
     scatter = float(np.std([scores[top], *again], ddof=1))
     floor = float(np.percentile(scores, 20))
-    if scores[top] - floor <= max(_LEAST_RISE * scatter, 0.02 * scores[top]):
+    if scores[top] - floor <= max(_LEAST_RISE * scatter, _LEAST_CONTRAST * scores[top]):
         raise TrackingError(
             f"the focus curve is flat from {low:g} to {high:g}: switch the cubic mask off, look at a place "
             "with detail, or widen the range"

@@ -23,6 +23,8 @@ from adof_cl.ssd_search import SsdSearch
 Array = NDArray[np.float64]
 
 _CONTEXT = 8  # pixels around a patch: a spline's memory of its end fades as 0.27 a pixel
+# What each step of the ladder leaves of its own, px^2: whole pixels spread evenly, the quadratic's pull.
+_LEFT_PX2 = {"integer": 1 / 12, "quadratic": 0.03**2, "gauss_newton": 0.0}
 _REACH_PX = 1.5  # a refinement that goes farther has left the match it started from
 _POLE = math.sqrt(3) - 2  # of the cubic spline's prefilter
 # White noise of variance 1 has a spline derivative of this variance: 9 (2/sqrt(3) - 1), eq. S11.
@@ -375,7 +377,10 @@ class GaussNewton:
         )
 
     def _fit(self, coefficients: Array, shift: Array) -> tuple[Array, Array]:
-        along = [_spline_rows(shift[:, a], n) for a, n in enumerate(self.shape)]
+        whole = np.floor(shift)
+        weights = _spline_weights(shift - whole)
+        rises = whole.astype(np.int64) + (_CONTEXT - 1)
+        along = [_spline_rows(weights[:, a], rises[:, a], n) for a, n in enumerate(self.shape)]
         image = (along[0] @ coefficients @ along[1].transpose(0, 2, 1)).reshape(len(shift), -1)
         return image, (self._solve @ image[:, :, None])[:, :, 0]
 
@@ -387,23 +392,25 @@ def _spline_inverse(n: int) -> Array:
     return np.asarray(np.linalg.inv(matrix / 6))
 
 
+# Rows: powers 0 to 3 of the fraction; columns: the four cubic B-splines that reach it.
+_BASIS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
+
+
 def _spline_weights(fraction: Array) -> Array:
     """Return the four cubic B-spline weights at a fraction of a pixel, (..., 4)."""
-    f = fraction
-    g = 1 - f
-    return np.stack([g**3, 4 - 3 * f * f * (2 - f), 4 - 3 * g * g * (2 - g), f**3], axis=-1) / 6
+    return np.asarray(fraction[..., None] ** np.arange(4) @ _BASIS)
 
 
-def _spline_rows(shift: Array, n: int) -> Array:
-    """Return the (k, n, n + 16) matrices that evaluate a spline at `shift` plus each of n whole pixels."""
-    whole = np.floor(shift)
-    weights = _spline_weights(shift - whole)
-    rows = np.arange(n)
-    rises = (_CONTEXT - 1 + whole).astype(np.int64)
-    matrix = np.zeros((len(shift), n, n + 2 * _CONTEXT))
-    columns = rises[:, None, None] + rows[None, :, None] + np.arange(4)
-    matrix[np.arange(len(shift))[:, None, None], rows[None, :, None], columns] = weights[:, None, :]
-    return matrix
+def _spline_rows(weights: Array, rises: NDArray[np.int64], n: int) -> Array:
+    """Return the (k, n, n + 16) matrices whose row r holds its four weights from column r + rise on."""
+    count, width = len(weights), n + 2 * _CONTEXT
+    line = np.zeros((count, n + width))
+    line[np.arange(count)[:, None], n + rises[:, None] + np.arange(4)] = weights
+    step = line.strides[1]
+    # Row r is the same line, r columns later: a view, not a copy.
+    return np.lib.stride_tricks.as_strided(
+        line[:, n:], (count, n, width), (line.strides[0], -step, step), writeable=False
+    )
 
 
 def _interpolated_noise(shift: Array) -> Array:
@@ -461,7 +468,7 @@ class TemplateTracker:
     ) -> None:
         if not templates:
             raise InputError("no template came: give at least one")
-        if refine not in ("gauss_newton", "quadratic", "integer"):
+        if refine not in _LEFT_PX2:
             raise InputError(f"refine is '{refine}': choose 'gauss_newton', 'quadratic' or 'integer'")
         kinds = {(t.pixels.shape, t.pixels.dtype.name) for t in templates}
         if len(kinds) > 1:
@@ -565,7 +572,7 @@ class TemplateTracker:
         measured: list[Measurement] = []
         for k in range(len(self.templates)):
             xy = feature_yx[k, ::-1].copy()
-            covariance = refined.covariance_yx[k, ::-1, ::-1].copy()
+            covariance = refined.covariance_yx[k, ::-1, ::-1] + _LEFT_PX2[self.refine] * np.eye(2)
             reason = self._why_lost(refined, k, xy, covariance, found.neighbourhood[k])
             if reason:
                 xy = self._aimed[k].copy()
