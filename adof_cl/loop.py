@@ -165,6 +165,8 @@ class Options:
         Noise-to-signal power ratio of the filters.
     iteration_limit
         The loop gives up after so many.
+    rig_name
+        What the cameras are called in a calibration file.
     """
 
     mask: str = "joint"
@@ -173,6 +175,7 @@ class Options:
     seat_um: float = 150.0
     nsr: float = 0.01
     iteration_limit: int = 600
+    rig_name: str = "rig"
 
 
 # Opposite corners: whatever blurs a corner moves both alike about the part's middle.
@@ -322,6 +325,7 @@ class Assembly:
         self._shown = False
         self._arm_at_rad = 0.0
         self._lost_in_a_row = 0
+        self._peg_stands = True
         self._last_move_um = np.zeros(3)
         self._features: dict[str, tuple[int, int]] = {}
 
@@ -360,12 +364,17 @@ class Assembly:
             self.rig.coarse.stop()
             self.rig.fine.stop()
 
-    def prepare(self) -> None:
+    @property
+    def camera_ids(self) -> tuple[str, str]:
+        """Names of both cameras in a calibration file."""
+        return f"{self.options.rig_name} camera 1", f"{self.options.rig_name} camera 2"
+
+    def prepare(self, known: StereoRig | None = None) -> None:
         """Find, focus, learn and calibrate: everything before the first servo step."""
         self.autofocus()
         self.take_templates(PEG, self.eyes, self.drawings[PEG])
         self.take_templates(HOLE, self.eyes, self.drawings[HOLE])
-        self.calibrate()
+        self.calibrate(known)
 
     # ---- looking ------------------------------------------------------------------------------------------
 
@@ -474,16 +483,25 @@ class Assembly:
         x, y = (round(float(v)) for v in centre_xy)
         return slice(max(0, y - half), min(rows, y + half)), slice(max(0, x - half), min(columns, x + half))
 
-    def calibrate(self) -> None:
-        """Step the hole through the work volume; learn both cameras, the rotation's centre and the fine axes.
+    def calibrate(self, known: StereoRig | None = None) -> None:
+        """Learn how cameras, rotation and fine axes lie to the coarse stage; the hole ends where it began.
 
-        The hole's middle is the target: the stage's own readings are the world it is calibrated in.
+        Parameters
+        ----------
+        known
+            A calibration of these cameras and this stage, taken before; without it the hole is stepped
+            through the work volume.
         """
-        coarse = self.rig.coarse
-        start = dict(coarse.position())
+        start = dict(self.rig.coarse.position())
         self._target = dict(start)
-        depth = float(self.world[HOLE][2])
         self._world_from_stage = self.world[HOLE] - np.array([start["x"], start["y"], start["z"]])
+        self.stereo = known or self._step_target(start)
+        self._learn_rotation(start)
+        self._learn_fine_stage()
+
+    def _step_target(self, start: Mapping[str, float]) -> StereoRig:
+        """Calibrate both cameras with the hole's middle as target: the stage's readings are the world."""
+        depth = float(self.world[HOLE][2])
         points: list[list[float]] = []
         pixels: tuple[list[Array], list[Array]] = ([], [])
         covariances: tuple[list[Array], list[Array]] = ([], [])
@@ -501,7 +519,7 @@ class Assembly:
                        for features, eye in zip(seen, self.eyes, strict=True)):  # fmt: skip
                     hidden += 1
                     continue
-                reading = coarse.position()
+                reading = self.rig.coarse.position()
                 points.append([reading["x"], reading["y"], reading["z"]])
                 for k, features in enumerate(seen):
                     pixels[k].append(features.middle)
@@ -519,20 +537,19 @@ class Assembly:
                 np.array(pixels[k]),
                 covariance_px2=np.array(covariances[k]),
                 work_volume_um=volume,
-                camera_id=f"camera {k + 1}",
+                camera_id=camera_id,
             )
-            for k in range(2)
+            for k, camera_id in enumerate(self.camera_ids)
         ]
-        self.stereo = StereoRig(cameras[0], cameras[1])
-        sigma_z = self.stereo.sigma_z_um()
-        tilt = math.degrees(self.stereo.angle_rad)
+        stereo = StereoRig(cameras[0], cameras[1])
+        sigma_z = stereo.sigma_z_um()
+        tilt = math.degrees(stereo.angle_rad)
         self._tell(
             "calibration",
             f"{len(points)} places ({hidden} hidden behind the peg), cameras {tilt:.2f}° apart, "
             f"depth good to {sigma_z:.2f} µm",
         )
-        self._learn_rotation(start)
-        self._learn_fine_stage()
+        return stereo
 
     def move_hole(self, there: Mapping[str, float]) -> tuple[Features, Features]:
         """Move the hole, focus on it, and measure it in both cameras."""
@@ -625,12 +642,13 @@ class Assembly:
     def coarse(self) -> None:
         """Bring the hole under the peg: x, y, theta from the image, z from depth, to the stand-off."""
         assert self.stereo is not None
+        self._peg_stands = True
         design = self.design
         axes = StageAxes(
             x=replace(self._axis("x", "um"), hysteresis=0.3),
             y=replace(self._axis("y", "um"), hysteresis=0.3),
             theta=replace(self._axis("theta", "rad"), dead_band=5e-4, hysteresis=2e-4),
-            z=replace(self._axis("z", "um"), dead_band=1.0, hysteresis=0.5),
+            z=replace(self._axis("z", "um"), dead_band=0.5, hysteresis=0.3),
         )
         period_s = design.settling_s + 2 / design.frame_rate_hz
         law = ServoLaw.from_delay(self.stereo.camera_1, axes, period_s, period_s)
@@ -638,6 +656,7 @@ class Assembly:
         self._target = dict(self.rig.coarse.position())
         self.show(self._next_mask())
         taught, resting = False, 0
+        depth_um = math.nan
         last_s = self.rig.clock.now_s - period_s
         while resting < 5:
             sight = self._see()
@@ -645,7 +664,11 @@ class Assembly:
             aligned = math.hypot(*sight.error_um) < 15 and abs(sight.error_rad) < 0.01
             wanted = self.options.stand_off_um if aligned and taught else _GATE_UM
             if sight.usable:
-                error = law.error(sight.hole_px, sight.desired_px, sight.centre_um, wanted - sight.depth_um)
+                # One frame's depth is noisier than the stage: near the end the stage's own motion is trusted
+                # between frames, and each frame only corrects it.
+                surprise = sight.depth_um - depth_um
+                depth_um = depth_um + 0.3 * surprise if abs(surprise) < 8 else sight.depth_um
+                error = law.error(sight.hole_px, sight.desired_px, sight.centre_um, wanted - depth_um)
                 command = law.command(error, quantiser.wake(error))
                 move = quantiser.move(command, now_s - last_s).array
             else:
@@ -655,6 +678,7 @@ class Assembly:
             codes = None if mask == self.eyes[0].mask else self._encoder.codes(mask)
             compute_ms = 1e3 * (time.perf_counter() - sight.begun)
             self._move(move)
+            depth_um += float(move[3])
             self._note("coarse", sight, wanted, command.array, compute_ms)
             self._change(mask, codes)
             if not sight.usable:
@@ -669,6 +693,7 @@ class Assembly:
 
     def fine(self) -> None:
         """Centre the peg over the hole with the fine stage, from features taken in focus once more."""
+        self._peg_stands = False
         self._teach_again()
         self._centre(tolerance_um=0.25, wanted_um=self.options.stand_off_um)
         self._tell("fine", "peg centred over the hole")
@@ -776,7 +801,7 @@ class Assembly:
             blurs = {part: eye.blur(self.world[part]) for part in (PEG, HOLE)}
             eye.measure(frame.pixels, blurs, expected)
         seen = [eye.seen for eye in self.eyes]
-        lost = sum(s[part].lost for s in seen for part in (PEG, HOLE))
+        lost_peg, lost_hole = (sum(s[part].lost for s in seen) for part in (PEG, HOLE))
         fix = triangulate_relative(
             self.stereo,
             seen[0][PEG].middle,
@@ -786,14 +811,16 @@ class Assembly:
             seen[0][PEG].middle_covariance + seen[0][HOLE].middle_covariance,
             seen[1][PEG].middle_covariance + seen[1][HOLE].middle_covariance,
         )
-        self._lost_in_a_row = self._lost_in_a_row + 1 if lost else 0
+        # A peg that stands still is where it was, also while the hole's edge behind it spoils its picture.
+        blind = bool(lost_hole or (lost_peg and not self._peg_stands))
+        self._lost_in_a_row = self._lost_in_a_row + 1 if blind else 0
         if self._lost_in_a_row > _LOST_LIMIT:
             reasons = [m.reason for s in seen for part in (PEG, HOLE) for m in s[part].measured if m.lost]
             raise TrackingError(
                 f"features were lost for {_LOST_LIMIT} frames in a row ({reasons[0]}): check light and view, "
                 "then start again"
             )
-        if not lost:
+        if not blind:
             self.world[HOLE] = self.world[PEG] + fix.xyz_um
         block = self.stereo.camera_1.matrix_px_per_um[:, :2]
         peg, hole = seen[0][PEG], seen[0][HOLE]
@@ -817,7 +844,8 @@ class Assembly:
             depth_um=float(fix.xyz_um[2]),
             depth_sigma_um=float(fix.sigma_um[2]),
             residual_px=float(fix.residual_px),
-            lost=lost,
+            lost=lost_peg + lost_hole,
+            usable=not blind,
             ssd_hole=float(np.mean([m.ssd for m in hole.measured])),
             ssd_peg=float(np.mean([m.ssd for m in peg.measured])),
         )
@@ -908,12 +936,9 @@ class _Sight:
     depth_sigma_um: float
     residual_px: float
     lost: int
+    usable: bool
     ssd_hole: float
     ssd_peg: float
-
-    @property
-    def usable(self) -> bool:
-        return self.lost == 0
 
 
 def cut_templates(image: Pixels, corners: Array, part: str, seen_turn: Array | None = None) -> list[Template]:

@@ -42,13 +42,22 @@ def run(
     compare: Annotated[
         bool, typer.Option("--compare", help="First measure every arm of the paper's Tables 2 and 3.")
     ] = False,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            "--calibration",
+            metavar="FILE",
+            help="Use the calibration.json of an earlier run of this rig (seed).",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print metrics.json at the end.")] = False,
     device: DeviceOption = None,
 ) -> None:
     """Assemble peg and hole on the twin: autofocus, templates, calibration, coarse, fine, insertion.
 
-    Writes metrics.json, iterations.json, figures and report.html (one file, opens without a server). Exits 0
-    when docked, 1 when the run ended otherwise, 130 on Ctrl-C; the folder is complete up to that moment.
+    Writes metrics.json, iterations.json, calibration.json, figures and report.html (one file, opens without a
+    server). Exits 0 when docked, 1 when the run ended otherwise, 130 on Ctrl-C; the folder is complete up to
+    that moment.
 
     Examples: adof run | adof run --seed 7 --out seven --compare | ADOF_DEVICE=cpu adof run --json
     """
@@ -56,6 +65,7 @@ def run(
         raise InputError(f"mask is '{mask}': choose one of {', '.join(MASKS)}")
 
     from adof_cl import twin as twins
+    from adof_cl.calibration_file import load_rig, save_calibration
     from adof_cl.cli.progress import Live
     from adof_cl.device import Device
     from adof_cl.loop import HOLE, PEG, PEG_OVER_HOLE, Assembly, Options
@@ -63,6 +73,9 @@ def run(
     from adof_cl.survey import survey
     from adof_cl.twin.parts import drawing_of
 
+    rig_name = f"twin {seed}"
+    ids = (f"{rig_name} camera 1", f"{rig_name} camera 2")
+    known = None if calibration is None else load_rig(calibration, camera_ids=ids)
     opened = Device.open(device)
     folder = _folder(out, seed)
     begun = time.perf_counter()
@@ -87,13 +100,15 @@ def run(
                 twin.design,
                 drawings,
                 record,
-                options=Options(mask=mask),
+                options=Options(mask=mask, rig_name=rig_name),
                 progress=live.tell,
                 observer=truth.observe,
                 milestone=truth.reached,
             )
             with assembly.stages_stopped_afterwards():
-                assembly.prepare()
+                assembly.prepare(known)
+                assert assembly.stereo is not None
+                save_calibration(folder / "calibration.json", assembly.stereo)
                 if compare:
                     arms = survey(assembly, truth.hole_px, progress=live.tell)
                 assembly.assemble()
