@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError, LimitError
-from adof_cl.optics import OpticalSystem, PupilGrid
+from adof_cl.optics import OpticalSystem, PupilGrid, require_finite
 from adof_cl.phase_terms import require_envelope, split, split_turns, wrapped_turns
 from adof_cl.program import Program
 
@@ -161,6 +161,42 @@ class Otf1d:
         shift = psi**2 / (3 * abs(alpha)) if abs(psi) < 3 * abs(alpha) else 0.0
         numbers = [part for value in (abs(alpha), abs(psi), shift) for part in split_turns(value, self._real)]
         return [*numbers, self._real.type(math.copysign(1.0, alpha))]
+
+
+def stationary_phase_otf(
+    u: NDArray[np.float64], alpha_rad: float, psi_rad: float = 0.0, *, as_printed: bool = False
+) -> NDArray[np.complex128]:
+    """Return the paper's approximation, to reproduce and to compare: never for a filter.
+
+    Off by 10 to 200 % of |H| where the paper uses it; above 1 near u = 0, where 1 itself is returned.
+
+    Parameters
+    ----------
+    u : any shape
+        Normalised frequency; 0 beyond the cut-off.
+    as_printed
+        True: Eq. 2 as the paper has it, without its phases pi/4 sgn(alpha u) and -psi^2 u/(3 alpha), so that
+        defocus does not enter at all. False: the whole of it.
+
+    Raises
+    ------
+    InputError
+        Not finite, or alpha = 0, where there is no stationary point.
+
+    Source
+    ------
+    The paper's Eq. 2; docs/maths.md, eq. O6.
+    """
+    require_finite(alpha_rad=alpha_rad, psi_rad=psi_rad)
+    if alpha_rad == 0:
+        raise InputError("alpha_rad is 0: the approximation wants a cubic mask, use the exact form")
+    at = np.asarray(u, dtype=np.float64)
+    safe = np.where(at == 0, 1.0, at)
+    phase = alpha_rad * at**3 / 4
+    if not as_printed:
+        phase = phase - psi_rad**2 * at / (3 * alpha_rad) + np.pi / 4 * np.sign(alpha_rad * at)
+    values = np.sqrt(np.pi / (12 * np.abs(alpha_rad * safe))) * np.exp(1j * phase)
+    return np.where(at == 0, 1.0, np.where(np.abs(at) > 2, 0.0, values))
 
 
 class SeparableMaskOtf:

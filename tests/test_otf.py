@@ -13,7 +13,7 @@ from adof_cl import reference
 from adof_cl.device import Device
 from adof_cl.errors import InputError, LimitError
 from adof_cl.optics import OpticalSystem, PupilGrid
-from adof_cl.otf import Otf1d, SeparableMaskOtf
+from adof_cl.otf import Otf1d, SeparableMaskOtf, stationary_phase_otf
 
 # alpha, psi, u, H to 20 digits, from the error-function form in 50-digit arithmetic.
 KNOWN = (
@@ -244,3 +244,45 @@ def test_profiles_that_step_too_far_or_do_not_fit_are_refused(device: Device) ->
         plan(np.full(64, np.nan))
     with pytest.raises(InputError, match="power of two"):
         SeparableMaskOtf(device, 100)
+
+
+# ---- the paper's Eq. 2 ----
+
+
+@pytest.mark.parametrize(
+    ("alpha", "psi", "u", "completed", "as_printed"),
+    [  # relative errors measured for the physics note, section 2
+        (20.0, 0.0, 0.44, 0.13, 0.85),
+        (53.5, 0.0, 0.1, 0.13, 0.68),
+        (53.5, 15.0, 0.77, 0.01, 0.30),
+        (53.5, 60.0, 0.44, 0.12, 2.1),
+        (500.0, 60.0, 1.2, 0.02, 1.7),
+    ],
+)
+def test_the_papers_approximation_is_off_by_what_was_measured(
+    alpha: float, psi: float, u: float, completed: float, as_printed: float
+) -> None:
+    exact = reference.otf_1d([u], alpha, psi)[0]
+    for wanted, printed in ((completed, False), (as_printed, True)):
+        found = stationary_phase_otf(np.array([u]), alpha, psi, as_printed=printed)[0]
+        off = abs(found - exact) / abs(exact)
+        rounding = 0.5 * 10 ** -(1 if wanted >= 1 else 2)  # the figures have two digits
+        assert off == pytest.approx(wanted, abs=rounding * 1.02)
+
+
+def test_the_completed_approximation_converges_as_the_mask_grows() -> None:
+    u = np.array([0.3, -0.3])
+    errors = [
+        np.abs(stationary_phase_otf(u, a, 5.0) / reference.otf_1d(u, a, 5.0) - 1).max() for a in (1e2, 1e4)
+    ]
+    assert errors[1] < errors[0] / 5  # as 1/sqrt(alpha): tenfold, with ripple
+
+
+def test_the_approximation_is_one_at_zero_and_nothing_beyond_the_cut_off() -> None:
+    found = stationary_phase_otf(np.array([0.0, 2.5]), -53.5, 15.0)
+    assert found.tolist() == [1, 0]
+
+
+def test_the_approximation_without_a_mask_is_refused() -> None:
+    with pytest.raises(InputError, match="exact form"):
+        stationary_phase_otf(np.array([0.4]), 0.0)

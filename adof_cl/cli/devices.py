@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from typing import Annotated
 
 import typer
-from rich.console import Console, JustifyMethod
+from rich.console import JustifyMethod
 from rich.table import Table
+
+from adof_cl.cli.tables import print_table
 
 DeviceOption = Annotated[
     str | None,
@@ -58,5 +59,4 @@ def devices(
             str(facts.compute_units),
             facts.driver_version,
         )
-    # A pipe has no width; cutting names short there would hide what the selector matches.
-    Console(width=None if sys.stdout.isatty() else 160).print(table)
+    print_table(table)

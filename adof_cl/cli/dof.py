@@ -33,7 +33,8 @@ def dof(
 
     Example: adof dof --near-um 0 --far-um 4000 --plot dof.png
     """
-    from adof_cl.errors import InputError
+    from adof_cl.cli.tables import print_table
+from adof_cl.errors import InputError
     from adof_cl.files import whole_file
     from adof_cl.mask import (
         PAPER_POINTS,
@@ -100,11 +101,9 @@ def dof(
 
 
 def _print(report: dict[str, Any], plot: Path | None) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False)
-    console.print(
+    print(
         f"Mask strength for a depth range ({report['criterion_lp_per_mm']:g} lp/mm, contrast "
         f"{report['threshold']:g}, f/{report['f_number']:g}):"
     )
@@ -124,25 +123,24 @@ def _print(report: dict[str, Any], plot: Path | None) -> None:
     table.add_row(
         "none", "", "", f"to {native['paper'] / 1000:.3f} mm", f"to {native['model'] / 1000:.3f} mm", ""
     )
-    console.print(table)
-    console.print("\nResolution in focus, lp/mm:")
+    print_table(table)
+    print("\nResolution in focus, lp/mm:")
     table = Table(box=None, header_style="bold")
     for heading in ("alpha", "published", "model"):
         table.add_column(heading, justify="right")
     for row in report["resolution"]:
         table.add_row(f"{row['alpha']:g}", f"{row['lp_per_mm_published']:g}", f"{row['lp_per_mm_model']:.1f}")
-    console.print(table)
+    print_table(table)
     if "chosen" in report:
-        console.print("\nMask for the range:")
+        print("\nMask for the range:")
     for chosen in report.get("chosen", []):
-        console.print(
+        print(
             f"{chosen['calibration']:>5}{', focus moved' if chosen['joint'] else ''}: alpha "
             f"{chosen['alpha']:.2f}, focus {chosen['focus_psi']:.2f} rad ({chosen['focus_um']:.0f} um)"
             f"{'' if chosen['covered'] else ', the strongest it knows: the range is deeper than it covers'}",
-            soft_wrap=True,
         )
     if plot is not None:
-        console.print(f"{plot}")
+        print(plot)
 
 
 def _draw(path: Path, paper: PaperCalibration, model: ModelCalibration) -> None:

@@ -1,0 +1,14 @@
+"""Tables on standard output, never cut: a number with its end missing is a wrong number."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.measure import Measurement
+from rich.table import Table
+
+
+def print_table(table: Table) -> None:
+    """Print a table as wide as its content, whatever the terminal's width."""
+    console = Console()
+    wanted = Measurement.get(console, console.options.update(max_width=10_000), table).maximum
+    Console(width=max(wanted, 1)).print(table)
