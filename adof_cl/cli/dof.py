@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from adof_cl.cli.tables import print_table
+
 if TYPE_CHECKING:
     from adof_cl.mask import ModelCalibration, PaperCalibration
 
@@ -33,8 +35,7 @@ def dof(
 
     Example: adof dof --near-um 0 --far-um 4000 --plot dof.png
     """
-    from adof_cl.cli.tables import print_table
-from adof_cl.errors import InputError
+    from adof_cl.errors import InputError
     from adof_cl.files import whole_file
     from adof_cl.mask import (
         PAPER_POINTS,
