@@ -102,7 +102,8 @@ def run(device: Device, *, small: bool = False) -> Iterator[Outcome]:
                 continue
             size = operation.small if small else operation.size
             try:
-                yield from operation.check(device, size, precision)
+                # A context of its own: nothing one check leaves in memory can help or mislead the next.
+                yield from operation.check(Device(device.facts, device.handle), size, precision)
             except AdofError as failure:
                 yield _broken(f"{name}, {precision}", str(failure))
             except Exception as failure:  # noqa: BLE001 (whatever a driver throws is this kernel's failure)
@@ -296,8 +297,8 @@ def check_wiener(device: Device, size: Size, precision: str) -> Iterator[Outcome
         "wiener_arrange", (half[1], ny), None,
         device.upload(otf), device.upload(order), out, np.int32(ny), np.int32(nx), real.type(0.375),
     )()  # fmt: skip
-    wanted = 0.375 * otf[order]
-    relative = np.abs(out.download() - wanted) / np.where(wanted == 0, 1, np.abs(wanted))
+    arranged = 0.375 * otf[order]
+    relative = np.abs(out.download() - arranged) / np.where(arranged == 0, 1, np.abs(arranged))
     name = f"wiener_arrange, {_at(size, precision)}"
     yield Outcome(name, ("wiener_arrange",), "|dG|/|G|", float(relative.max()), _eps(precision))
 
