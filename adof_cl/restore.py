@@ -299,6 +299,11 @@ class Restore:
             A number, or (ny, nx // 2 + 1) real on the device.
         row_entry, col_entry
             Which row of a (k, n) table to take.
+
+        Raises
+        ------
+        InputError
+            Another shape or type, no such entry, or a negative nsr; the slot keeps what it had.
         """
         ny, nx = self.padded_shape
         slot = _checked_slot(slot)
