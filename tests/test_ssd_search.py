@@ -46,8 +46,8 @@ def check_bytes(device: Device, family: str, template: tuple[int, int], image: I
     plan = SsdSearch(device, image.shape, template, search, 2, family=family)
     origins = windows(seed, image.shape, search, 2)
     rng = np.random.default_rng(seed + 1)
-    templates = rng.integers(0, 255, (2, *template), endpoint=True).astype(np.uint8)
-    templates[1] = np.where(templates[1] < 128, 0, 255)  # the largest products
+    templates = rng.integers(230, 255, (2, *template), endpoint=True).astype(np.uint8)  # the largest odd sums
+    templates[1] = np.where(templates[1] < 242, 0, 255)
     plan.set_templates(templates)
     plan.set_windows(origins)
     found = plan.search(image)
@@ -68,7 +68,9 @@ def test_byte_scores_are_bit_equal_to_int64_arithmetic(
 ) -> None:
     if device.facts.simulated and max(template) > 5:
         pytest.skip("a simulator takes minutes for this size")
-    check_bytes(device, family, template, picture(3, (83, 141), "uint8"), 7)
+    image = picture(3, (83, 141), "uint8")
+    image[:, 20:110] |= 0b11100000  # bright: float32 alone would not hold the sums
+    check_bytes(device, family, template, image, 7)
 
 
 @families
@@ -229,13 +231,17 @@ def test_the_gain_and_offset_score_of_other_images_is_within_its_bound(
         template = (3, 5)
     image = picture(31, (61, 83), dtype)
     if dtype == "uint16":
-        image = (50_000 + image // 1000).astype(np.uint16)  # bright and faint
+        image = (65_000 + image // 13_000).astype(np.uint16)  # bright and faint
+    else:
+        image = (1e6 + 10 * image).astype(np.float32)
     search = (template[0] + 13, template[1] + 52)
     plan = SsdSearch(
         device, image.shape, template, search, 1, dtype=dtype, score="gain_offset", family=family
     )
     wanted = cut(image, (9, 14), template)
-    brighter = (wanted // 2 + 1000).astype(dtype) if dtype == "uint16" else (wanted * 3 - 5).astype(dtype)
+    brighter = (
+        (2 * (wanted - 64_990)).astype(dtype) if dtype == "uint16" else (3 * (wanted - 1e6)).astype(dtype)
+    )
     plan.set_templates(brighter[None])
     plan.set_windows([(2, 3)])
     found = plan.search(image)

@@ -83,16 +83,17 @@ def test_without_noise_the_place_comes_out_to_a_thousandth_of_a_pixel() -> None:
 
 @pytest.mark.parametrize(
     ("make", "gain", "offset"),
-    [(texture, 1.0, 0.0), (corner, 1.0, 0.0), (corner, 1.2, 0.0), (texture, 0.8, 20.0)],
+    [(texture, 1.0, 0.0), (corner, 1.0, 0.0), (corner, 1.2, 0.0), (texture, 0.8, 20.0), (texture, 0.4, 60.0)],
 )
 def test_with_noise_the_error_is_within_1_3_of_the_noise_bound_and_as_large_as_its_covariance_says(
     make: Any, gain: float, offset: float
 ) -> None:
-    errors, covariances, bound = refine_many(make, NOISE, gain, offset)
+    errors, covariances, bound = refine_many(make, NOISE, gain, offset, rounds=120)
     assert rms(errors) < 1.3 * bound
-    # The mean of n chi-squared pairs over 2 scatters by 1/sqrt(n): four of those either way.
+    # The mean of n chi-squared pairs over 2 scatters by 1/sqrt(n). Interpolation takes some of the image's
+    # noise, of which fine texture gains.
     normalised = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors) / 2
-    assert abs(normalised.mean() - 1) < 4 / math.sqrt(len(errors))
+    assert 0.6 < normalised.mean() < 1 + 4 / math.sqrt(len(errors))
 
 
 def test_a_fifth_more_light_moves_a_corner_by_less_than_0_03_px_where_the_plain_score_moves_it_by_0_2() -> (
@@ -130,7 +131,10 @@ def test_the_quadratic_finds_the_minimum_of_a_quadratic(
 def test_the_quadratic_of_scores_without_a_minimum_stays_in_the_middle() -> None:
     edge = np.ones((3, 3))
     edge[0] = np.inf
-    assert quadratic_minimum(np.stack([edge, np.zeros((3, 3)), -np.eye(3)])).tolist() == [[0, 0]] * 3
+    y, x = np.mgrid[-1:2, -1:2]
+    hill = -((y - 0.3) ** 2) - (x + 0.2) ** 2
+    saddle = (y - 0.3) ** 2 - (x + 0.2) ** 2
+    assert quadratic_minimum(np.stack([edge, np.zeros((3, 3)), hill, saddle])).tolist() == [[0, 0]] * 4
 
 
 def test_a_flat_template_noise_alone_and_a_bare_edge_are_refused_and_a_corner_is_not() -> None:
@@ -235,14 +239,15 @@ def scene() -> Scene:
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "float32"])
-def test_features_are_followed_through_steady_motion_within_four_of_their_sigmas(
+def test_features_are_followed_through_gathering_motion_within_four_of_their_sigmas(
     device: Device, dtype: str
 ) -> None:
     scene = Scene(dtype)
     tracker = tracker_of(device, scene)
     tracker.aim(PLACES)
-    for step in range(8):
-        shift = np.array([3.3, -1.7]) * step  # leaves the first window in a few frames
+    # Farther a frame than half the window: only the last displacement, carried on, keeps the features in it.
+    for step, along in enumerate((0.0, 8.3, 20.6, 33.2, 44.1)):
+        shift = np.array([along, -1.7 * step])
         measured = tracker.track(device.upload(scene.frame(shift, gain=1 - 0.02 * step)))
         for place, m in zip(PLACES, measured, strict=True):
             assert not m.lost, m.reason
@@ -458,6 +463,11 @@ def test_where_there_is_no_corner_none_is_located() -> None:
         locate_corner(image, middle_of_an_edge)
     with pytest.raises(TrackingError, match="no corner"):
         locate_corner(image, corners.mean(axis=0))
+    junction = np.full((100, 110), 200.0)  # an edge from top to bottom, and one that ends at it
+    junction[:50, 60:], junction[50:, 60:] = 60, 110
+    junction += 2.5 * rng.normal(size=junction.shape)
+    with pytest.raises(TrackingError, match="runs straight through"):
+        locate_corner(junction, (59.5, 49.5))
     with pytest.raises(InputError, match="border"):
         locate_corner(image, (-60, 50))
     with pytest.raises(InputError, match="finite column and row"):
