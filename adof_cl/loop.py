@@ -185,6 +185,9 @@ _LOST_LIMIT = 12
 _TURN_RAD = 0.004  # a template 20 pixels wide turned by this is off by 0.04 at its rim
 _INSET_PX = {PEG: 12.0, HOLE: -8.0}  # templates lie on the peg's face, and on the plate around the hole
 _BENT_PX = 0.5  # a target whose two features moved apart by more was half hidden
+# The hole's middle may lie 200 um from the axis it turns about, and turn by 0.1 rad; the peg may be 80 um off
+# its drawn depth: what is left is a fault.
+_DISAGREEMENT_UM = 150.0
 _DEFOCUS_SHARE = 0.6  # largest |psi| / (3 alpha) of the joint mask
 
 Milestone = Callable[[str], None]
@@ -328,6 +331,7 @@ class Assembly:
         self._peg_stands = True
         self._last_move_um = np.zeros(3)
         self._features: dict[str, tuple[int, int]] = {}
+        self._last_frame_s: dict[int, float] = {}
 
     # ---- the whole run ------------------------------------------------------------------------------------
 
@@ -389,8 +393,21 @@ class Assembly:
         self.rig.clock.wait(self.design.settling_s)
 
     def look(self) -> tuple[Frame, Frame]:
-        """Take the next pair of frames."""
-        return self.rig.camera_1.grab(), self.rig.camera_2.grab()
+        """Take the next pair of frames.
+
+        Raises
+        ------
+        TrackingError
+            A camera gave an old frame again: a loop that went on would move on what is no longer so.
+        """
+        frames = self.rig.camera_1.grab(), self.rig.camera_2.grab()
+        for number, frame in enumerate(frames, start=1):
+            if not frame.time_s > self._last_frame_s.get(number, -math.inf):
+                raise TrackingError(
+                    f"camera {number} gave its frame of {frame.time_s:.3f} s again: check that it is running"
+                )
+            self._last_frame_s[number] = frame.time_s
+        return frames
 
     def focused(self, depth_um: float) -> Mask:
         """Return the mask that brings a depth into focus and codes nothing."""
@@ -713,8 +730,10 @@ class Assembly:
         inverse = np.linalg.inv(self._fine_px_per_um)
         resting = 0
         mean_um, mean_z, count = np.zeros(2), 0.0, 0
+        last_s = self.rig.clock.now_s - 1 / self.design.frame_rate_hz
         while resting < 6:
             sight = self._see()
+            dt_s, last_s = self.rig.clock.now_s - last_s, self.rig.clock.now_s
             mask = self._next_mask()
             codes = None if mask == self.eyes[0].mask else self._encoder.codes(mask)
             z_left = wanted_um - sight.depth_um
@@ -739,9 +758,8 @@ class Assembly:
             mean_z -= dz
             self._move(np.array([0.0, 0.0, 0.0, dz]))
             self._note("fine" if wanted_um == self.options.stand_off_um else "insert", sight, wanted_um,
-                       np.array([move[0], move[1], 0.0, dz]), compute_ms)  # fmt: skip
+                       np.array([move[0], move[1], 0.0, dz]) / dt_s, compute_ms)  # fmt: skip
             self._change(mask, codes)
-            self._last_peg_move_px = self._fine_px_per_um @ move
             calm = sight.usable and count >= 6 and math.hypot(*mean_um) < tolerance_um and abs(mean_z) < 1.0
             resting = resting + 1 if calm else 0
         fine.wait_until_still()
@@ -822,6 +840,7 @@ class Assembly:
             )
         if not blind:
             self.world[HOLE] = self.world[PEG] + fix.xyz_um
+            self._require_agreement()
         block = self.stereo.camera_1.matrix_px_per_um[:, :2]
         peg, hole = seen[0][PEG], seen[0][HOLE]
         desired = self._desired(block, peg)
@@ -849,6 +868,22 @@ class Assembly:
             ssd_hole=float(np.mean([m.ssd for m in hole.measured])),
             ssd_peg=float(np.mean([m.ssd for m in peg.measured])),
         )
+
+    def _require_agreement(self) -> None:
+        """Refuse to go on when vision and stage tell different stories of where the hole is.
+
+        Raises
+        ------
+        TrackingError
+            They differ by more than calibration, rotation about a centre off the hole and motion during an
+            exposure can explain.
+        """
+        apart = float(np.linalg.norm(self.world[HOLE] - self._hole_world()))
+        if apart > _DISAGREEMENT_UM:
+            raise TrackingError(
+                f"the hole is seen {apart:.0f} um from where its stage says it is, at most "
+                f"{_DISAGREEMENT_UM:.0f} was wanted: check cameras and stage, then start again"
+            )
 
     def _desired(self, block: Array, peg: Features) -> Array:
         """Return where the hole's corners belong: around the peg's middle, turned as the peg is."""
