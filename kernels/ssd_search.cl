@@ -315,8 +315,8 @@ static inline __attribute__((always_inline)) void centred_sums(const float *wind
 }
 #endif
 
-__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
-void ssd_search(
+__kernel void __attribute__((reqd_work_group_size(1, 1, 1)))
+ssd_search(
     __global const pixel *image,
     __global const float *templates,
     __global const int   *sums,
@@ -464,8 +464,8 @@ typedef int number;           // exact
 typedef float number;
 #endif
 
-__kernel __attribute__((reqd_work_group_size(GROUP_COLUMNS, GROUP_ROWS, 1)))
-void ssd_search(
+__kernel void __attribute__((reqd_work_group_size(GROUP_COLUMNS, GROUP_ROWS, 1)))
+ssd_search(
     __global const pixel *image,
     __global const float *templates,
     __global const int   *sums,
@@ -626,8 +626,8 @@ void ssd_search(
 
 // ---- both families ------------------------------------------------------------------------------------------
 
-__kernel __attribute__((reqd_work_group_size(BEST_ITEMS, 1, 1)))
-void ssd_search_best(
+__kernel void __attribute__((reqd_work_group_size(BEST_ITEMS, 1, 1)))
+ssd_search_best(
     __global const pixel *image,
     __global const int   *origins,
     __global const int   *scores,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -368,11 +369,17 @@ def test_templates_without_contrast_or_not_finite_are_refused(device: Device) ->
         plan.set_template(0, np.full((7, 5), np.nan, np.float32))
 
 
+@pytest.mark.parametrize("vector_bytes", [4, 32])
+def test_bytes_are_exact_with_vectors_of_four_and_eight_lanes(
+    device: Device, monkeypatch: pytest.MonkeyPatch, vector_bytes: int
+) -> None:
+    monkeypatch.setattr(device, "facts", replace(device.facts, vector_bytes=vector_bytes))
+    check_bytes(device, "lanes", (5, 3), picture(3, (83, 141), "uint8"), 7)
+
+
 def test_a_device_with_too_little_local_memory_is_refused_in_words(
     device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from dataclasses import replace
-
     monkeypatch.setattr(device, "facts", replace(device.facts, local_memory_bytes=8192))
     with pytest.raises(DeviceError, match="bytes of local memory"):
         SsdSearch(device, (90, 90), (64, 64), (80, 80), 1, dtype=np.float32, family="groups")
