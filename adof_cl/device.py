@@ -193,6 +193,7 @@ class DeviceArray:
                 f"{device.facts.max_allocation_bytes}: use a smaller frame or another device"
             )
         self.buffer = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 1))
+        device.made(self.buffer)
 
     def upload(self, values: NDArray[Any]) -> DeviceArray:
         """Copy `values` (same shape and dtype) to the device; returns when the host may reuse them."""
@@ -227,6 +228,7 @@ class Device:
         self.facts = facts
         self.handle = handle
         self.context = cl.Context([handle])
+        self._kept: list[cl.Buffer] = []
         if profiling:
             properties = cl.command_queue_properties.PROFILING_ENABLE
             self.queue = cl.CommandQueue(self.context, handle, properties=properties)
@@ -248,6 +250,11 @@ class Device:
             return cls(facts, found[facts.index][1], profiling=profiling)
         except cl.Error as failure:
             raise DeviceError(f"{facts} was found but could not be opened: {failure}") from failure
+
+    def made(self, buffer: cl.Buffer) -> None:
+        """Keep a simulator's buffers alive: it forgets what was written where an address is used again."""
+        if self.facts.simulated:
+            self._kept.append(buffer)
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> DeviceArray:
         """Allocate an uninitialised array."""

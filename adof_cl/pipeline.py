@@ -178,6 +178,8 @@ class CameraPipeline:
     def _enqueue(self, frame: Pixels, blurs: Mapping[str, Blur | None]) -> None:
         self._frame.upload(frame)
         self._restored = [part for part, blur in blurs.items() if blur is not None]
+        if self._restored:
+            self._restore.transform(self._frame)  # once for all parts
         for part, blur in blurs.items():
             if blur is None:
                 continue
@@ -187,7 +189,7 @@ class CameraPipeline:
                 h_rows, h_columns = (plan(pair) for plan in self._otf[part])
                 self._restore.set_filter_axes_device(h_rows, h_columns, self.nsr, slot)
                 self._blurs[part] = blur
-            self._restore(self._frame, self._images[part], slot)
+            self._restore.apply(self._images[part], slot)
 
     def _require_part(self, part: str) -> None:
         if part not in self.parts:

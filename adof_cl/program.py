@@ -155,6 +155,8 @@ class Program:
         self.source = text + _expand(source, _read(source), included)
         self.options = [
             "-cl-std=CL1.2",
+            # Oclgrind stops at an instruction its own optimiser writes.
+            *(["-cl-opt-disable"] if device.facts.simulated else []),
             *options,
             *(_define(name, value) for name, value in sorted((defines or {}).items())),
         ]

@@ -189,7 +189,6 @@ class Restore:
                 **cut.defines,
             },
             generated=("restore_passes.h", pass_lists(row, column)),
-            options=_options(device),
         )
 
         frequency = np.arange(cut.blocks * cut.block)
@@ -225,7 +224,6 @@ class Restore:
             device,
             "wiener.cl",
             {"REAL_IS_DOUBLE": self._real == np.float64, "WIENER_BLOCK": cut.block, "WIENER_RUN": cut.run},
-            options=_options(device),
         )
         size = (cut.blocks * cut.block // cut.run, 4 if cut.run > 1 else ny)
         i32, scale, zero = np.int32, self._real.type(0.5 / (nx * ny)), self._real.type(0)
@@ -479,11 +477,6 @@ class Restore:
         if slot not in self._filters:
             self._filters[slot] = self.device.empty(self._filter_shape, self._real)
         return self._filters[slot]
-
-
-def _options(device: Device) -> list[str]:
-    """Return compiler options: a simulator knows less of LLVM than LLVM's optimiser writes."""
-    return ["-cl-opt-disable"] if device.facts.simulated else []
 
 
 def _io_defines(in_dtype: np.dtype[Any], out_dtype: np.dtype[Any]) -> dict[str, int | str]:

@@ -50,7 +50,6 @@ class WienerFilter:
             device,
             "wiener.cl",
             {"REAL_IS_DOUBLE": self._real == np.float64},
-            options=["-cl-opt-disable"] if device.facts.simulated else [],
         )
         self._h_rows = device.empty((ny,), self._complex)
         self._h_cols = device.empty((nx,), self._complex)
