@@ -25,7 +25,8 @@
 //   field     (m) cplx   the pupil, zero-padded; x and y of otf_fft: see stockham.h
 //   roots     (m/2) cplx exp(-2 pi i k/m)
 //   otf       (n + 1) cplx   result at u = 0, 2/n .. 2
-//   n or m, s, sign
+//   n or m, s, sign      see stockham.h
+//   scale     real       1/(m n): the inverse transform's and the definition's
 //
 // One work-item per sample or butterfly; no local memory, no barriers.
 // Error: that of the cells, 0.2 (3 alpha + 2 psi)/n^2, and of rounding: 1e-6 in float, 1e-15 in double.
@@ -128,7 +129,6 @@ __kernel void otf_fft(
     stockham_pass(x, y, roots, 0, 1, m, s, j, sign);
 }
 
-// scale = 1/(m n): the inverse transform's and the definition's.
 __kernel void otf_power(__global cplx *field, const int m, const real scale)
 {
     const int i = get_global_id(0);

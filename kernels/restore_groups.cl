@@ -9,6 +9,7 @@
 //   frame     (ROWS, COLS) IN_TYPE              the image to restore
 //   image     (ROWS, COLS) OUT_TYPE             the restored image; integers are rounded and clamped
 //   spectrum  (BLOCKS, HELD, 2, BLOCK) real     block of columns, row, real or imaginary, column in the block
+//   filtered  like spectrum                     may be the spectrum itself
 //   filter    (BLOCKS, NY, 2, BLOCK) real       the same, rows digit-reversed, scaled by 1 / (2 NX NY)
 //   position  (2, BLOCKS * BLOCK) int           where frequency k, and then NX - k, lies after the passes
 //   row_blend (NX - COLS) real, column_blend (NY - ROWS) real   share of the near edge in the padding
@@ -213,7 +214,7 @@ restore_rows_forward(
 __kernel void __attribute__((reqd_work_group_size(COLUMN_ITEMS, 1, 1)))
 restore_columns(
     __global const real *spectrum,
-    __global real       *filtered,              // may be the spectrum itself
+    __global real       *filtered,
     __global const real *restrict filter,
     __global const real *restrict column_turns,
     __global const real *restrict column_blend,

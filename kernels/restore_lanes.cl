@@ -10,6 +10,7 @@
 //   frame     (ROWS, COLS) IN_TYPE              the image to restore
 //   image     (ROWS, COLS) OUT_TYPE             the restored image; integers are rounded and clamped
 //   spectrum  (BLOCKS, HELD, 2, LANES) real     block of columns, row, real or imaginary, column in the block
+//   filtered  like spectrum                     may be the spectrum itself
 //   filter    (BLOCKS, NY, 2, LANES) real       the same, rows digit-reversed, scaled by 1 / (2 NX NY)
 //   position  (2, BLOCKS * LANES) int           where frequency k, and then NX - k, lies after the passes
 //   row_blend (NX - COLS) real, column_blend (NY - ROWS) real   share of the near edge in the padding
@@ -269,7 +270,7 @@ restore_rows_forward(
 __kernel RESTORE_WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
 restore_columns(
     __global const vec  *spectrum,
-    __global vec        *filtered,              // may be the spectrum itself
+    __global vec        *filtered,
     __global const vec  *restrict filter,
     __global const real *restrict column_turns,
     __global const real *restrict column_blend)
