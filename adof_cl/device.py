@@ -222,11 +222,17 @@ class Device:
     """One opened OpenCL device: a context and one in-order queue.
 
     Make it with `Device.open()`. Plans take it, keep it, and enqueue on its queue.
+
+    Attributes
+    ----------
+    events
+        None, or a list to which every launch adds its event: set one on a profiling device to time kernels.
     """
 
     def __init__(self, facts: DeviceFacts, handle: cl.Device, *, profiling: bool = False) -> None:
         self.facts = facts
         self.handle = handle
+        self.events: list[cl.Event] | None = None
         self.context = cl.Context([handle])
         self._kept: list[cl.Buffer] = []
         if profiling:

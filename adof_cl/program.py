@@ -112,9 +112,12 @@ class Launch:
 
     def __call__(self) -> cl.Event:
         """Enqueue on the device's in-order queue and return the event."""
-        return cl.enqueue_nd_range_kernel(
+        event = cl.enqueue_nd_range_kernel(
             self._device.queue, self._kernel, self._global_size, self._local_size
         )
+        if self._device.events is not None:
+            self._device.events.append(event)
+        return event
 
 
 class Program:
