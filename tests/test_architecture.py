@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -152,6 +153,25 @@ def test_every_equation_a_source_cites_is_in_the_maths() -> None:
 def test_every_header_compiles_alone(path: Path, device: Device) -> None:
     source = f'#include "{path.name}"\n'
     Program(device, "otf.cl", {}, generated=(f"only_{path.name}", source))
+
+
+@pytest.mark.parametrize(
+    ("contract", "key", "free"),
+    [
+        ("the reference page is", "source_modules", {"cli", "twin", "selftest", "reference"}),
+        ("the twin shares nothing", "forbidden_modules", {"twin", "optics", "reference", "errors"}),
+        ("only device and program", "source_modules", {"device", "program"}),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_an_import_contract_leaves_no_module_out(contract: str, key: str, free: set[str]) -> None:
+    settings = tomllib.loads((TREE / "pyproject.toml").read_text())["tool"]["importlinter"]
+    found = next(c for c in settings["contracts"] if c["name"].startswith(contract))
+    listed = {name.removeprefix("adof_cl.") for name in found[key] if name.startswith("adof_cl.")}
+    package = TREE / "adof_cl"
+    modules = {path.stem for path in package.glob("*.py")} - {"__init__"}
+    modules |= {path.parent.name for path in package.glob("*/__init__.py")}
+    assert listed == modules - free
 
 
 def test_no_path_of_one_machine_is_in_the_tree() -> None:
