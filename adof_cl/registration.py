@@ -72,21 +72,25 @@ class Registration:
         return np.asarray(places_um @ self.matrix.T + self.origin_px)
 
 
-def as_seen(drawing: Drawing, matrix: Array) -> tuple[NDArray[np.float32], NDArray[np.uint8], Array]:
+def as_seen(
+    drawing: Drawing, matrix: Array, fraction_px: Array | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], Array]:
     """Render the drawing as a camera with `matrix` (pixels per um) sees it, whole pixels integrated.
 
-    Returns the picture, where it is judged (uint8, 0 or 1), and where the part's origin lies in it, (x, y).
+    The part's origin lies `fraction_px` beyond a pixel's centre, by default on one. Returns the picture,
+    where it is judged (uint8, 0 or 1), and where the part's origin lies in it, (x, y).
     """
     rows, columns = drawing.radiance.shape
     finer = 4
     centre = np.array(drawing.centre_yx[::-1])
     corners = np.array([[x, y] for x in (0, columns - 1) for y in (0, rows - 1)]) - centre
     seen = corners * drawing.pitch_um @ matrix.T
-    low = np.floor(seen.min(axis=0)).astype(int) - 1
-    size = np.ceil(seen.max(axis=0)).astype(int) + 2 - low
+    at = np.zeros(2) if fraction_px is None else fraction_px
+    low = np.floor(seen.min(axis=0) + at).astype(int) - 1
+    size = np.ceil(seen.max(axis=0) + at).astype(int) + 2 - low
     to_fine = finer * matrix * drawing.pitch_um
     # A pixel's centre lies at an integer; its first finer sample half a pixel less before it.
-    shift = -finer * low + (finer - 1) / 2 - to_fine @ centre
+    shift = finer * (at - low) + (finer - 1) / 2 - to_fine @ centre
     warp = np.column_stack([to_fine, shift])
     shape = (int(size[0]) * finer, int(size[1]) * finer)
     soft = cv2.GaussianBlur(drawing.radiance, (0, 0), max(0.3, 0.4 / float(np.abs(to_fine).max())))
@@ -94,7 +98,7 @@ def as_seen(drawing: Drawing, matrix: Array) -> tuple[NDArray[np.float32], NDArr
     where = cv2.warpAffine(drawing.judged.astype(np.float32), warp, shape, flags=cv2.INTER_LINEAR)
     picture = fine.reshape(int(size[1]), finer, int(size[0]), finer).mean(axis=(1, 3), dtype=np.float32)
     judged = where.reshape(int(size[1]), finer, int(size[0]), finer).mean(axis=(1, 3)) > 0.99
-    return picture, judged.astype(np.uint8), -low.astype(np.float64)
+    return picture, judged.astype(np.uint8), at - low
 
 
 def register(
@@ -181,7 +185,8 @@ def _band(picture: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _refined(image: NDArray[np.float32], drawing: Drawing, matrix: Array, origin_px: Array) -> Registration:
-    picture, judged, origin = as_seen(drawing, matrix)
+    # Rendered at the place found last, to the fraction: what is left to interpolate would shift it.
+    picture, judged, origin = as_seen(drawing, matrix, origin_px - np.floor(origin_px))
     start = origin_px - origin
     low = np.maximum(np.floor(start - 8).astype(int), 0)
     high = np.minimum(np.ceil(start + np.array(picture.shape[::-1]) + 8).astype(int), image.shape[::-1])
