@@ -176,6 +176,8 @@ class CameraPipeline:
         return {part: self._images[part].download() for part in self._restored}
 
     def _enqueue(self, frame: Pixels, blurs: Mapping[str, Blur | None]) -> None:
+        for part in blurs:
+            self._require_part(part)
         self._frame.upload(frame)
         self._restored = [part for part, blur in blurs.items() if blur is not None]
         if self._restored:
