@@ -16,7 +16,7 @@ import typer
 from adof_cl import __version__
 from adof_cl.errors import AdofError
 
-COMMANDS: tuple[str, ...] = ("run", "devices", "phase", "otf", "psf", "dof", "restore", "selftest")
+COMMANDS: tuple[str, ...] = ("run", "devices", "phase", "otf", "psf", "dof", "restore", "selftest", "bench")
 """Modules of this package, in the order `adof --help` lists them."""
 
 
