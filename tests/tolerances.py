@@ -58,7 +58,7 @@ def phase_rad(precision: str) -> float:
 
 
 def image_prep_real(frame: np.ndarray, dark: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Absolute limit of gain (frame - dark) in float32: dark, gain, difference and product each round once."""
+    """Absolute limit of gain (frame - dark): each of the four numbers and results rounds once, in float32."""
     return 2 * eps("float32") * gain * (frame + np.abs(dark)) + 1e-30
 
 
