@@ -188,6 +188,7 @@ _BENT_PX = 0.5  # a target whose two features moved apart by more was half hidde
 # The hole's middle may lie 200 um from the axis it turns about, and turn by 0.1 rad; the peg may be 80 um off
 # its drawn depth: what is left is a fault.
 _DISAGREEMENT_UM = 150.0
+_FUSED_FRAMES = 40  # of depth: noise falls sixfold, and what changes with depth is forgotten in three seconds
 _DEFOCUS_SHARE = 0.6  # largest |psi| / (3 alpha) of the joint mask
 
 Milestone = Callable[[str], None]
@@ -332,6 +333,8 @@ class Assembly:
         self._last_move_um = np.zeros(3)
         self._features: dict[str, tuple[int, int]] = {}
         self._last_frame_s: dict[int, float] = {}
+        self._last_z: tuple[float, float] | None = None
+        self._depth_offset_um, self._frames_fused = 0.0, 0
 
     # ---- the whole run ------------------------------------------------------------------------------------
 
@@ -376,8 +379,9 @@ class Assembly:
     def prepare(self, known: StereoRig | None = None) -> None:
         """Find, focus, learn and calibrate: everything before the first servo step."""
         self.autofocus()
-        self.take_templates(PEG, self.eyes, self.drawings[PEG])
-        self.take_templates(HOLE, self.eyes, self.drawings[HOLE])
+        # Seen from the side the peg stands before nothing, and its rim shows.
+        self.take_templates(PEG, (self.drawings[PEG], self.drawings[PEG_OVER_HOLE]))
+        self.take_templates(HOLE, (self.drawings[HOLE], self.drawings[HOLE]))
         self.calibrate(known)
 
     # ---- looking ------------------------------------------------------------------------------------------
@@ -446,12 +450,12 @@ class Assembly:
             self.world[part] = np.array([0.0, 0.0, found.position])
             self._tell("autofocus", f"{part} at {found.position:.0f} ± {found.sigma:.0f} µm")
 
-    def take_templates(self, part: str, eyes: Sequence[_Eye], drawing: Drawing) -> None:
-        """Take pictures of a part's features in focus, tied to its drawing."""
+    def take_templates(self, part: str, drawings: Sequence[Drawing]) -> None:
+        """Take pictures of a part's features in focus, tied to its drawing: one for each camera, 1 first."""
         self.show(self.focused(float(self.world[part][2])))
         frames = self.look()
         images = [frames[0].pixels]
-        for eye, frame in zip(eyes, frames, strict=False):
+        for eye, frame, drawing in zip(self.eyes, frames, drawings, strict=False):
             if eye.number == 2:
                 restored = eye.pipeline.restored(frame.pixels, {part: eye.blur(self.world[part])})
                 images.append(restored[part])
@@ -522,7 +526,8 @@ class Assembly:
         points: list[list[float]] = []
         pixels: tuple[list[Array], list[Array]] = ([], [])
         covariances: tuple[list[Array], list[Array]] = ([], [])
-        planes = np.linspace(depth, 800.0, 4)
+        # Down to where the peg's tip is 200 um away whatever x and y are: what is docked near is measured near.
+        planes = np.linspace(depth, float(self.world[PEG][2]) + 500.0, 5)
         # About where the peg stands, leaning to the side on which camera 2 does not see the peg in front.
         middle = np.array([start["x"], start["y"]]) + (self.world[PEG] - self.world[HOLE])[:2]
         steps = ((0.0, 0.0), (600.0, -300.0), (600.0, 300.0), (-400.0, 300.0), (-400.0, -300.0))
@@ -665,7 +670,7 @@ class Assembly:
             x=replace(self._axis("x", "um"), hysteresis=0.3),
             y=replace(self._axis("y", "um"), hysteresis=0.3),
             theta=replace(self._axis("theta", "rad"), dead_band=5e-4, hysteresis=2e-4),
-            z=replace(self._axis("z", "um"), dead_band=0.5, hysteresis=0.3),
+            z=replace(self._axis("z", "um"), dead_band=0.2, hysteresis=0.4),
         )
         period_s = design.settling_s + 2 / design.frame_rate_hz
         law = ServoLaw.from_delay(self.stereo.camera_1, axes, period_s, period_s)
@@ -673,7 +678,6 @@ class Assembly:
         self._target = dict(self.rig.coarse.position())
         self.show(self._next_mask())
         taught, resting = False, 0
-        depth_um = math.nan
         last_s = self.rig.clock.now_s - period_s
         while resting < 5:
             sight = self._see()
@@ -681,11 +685,8 @@ class Assembly:
             aligned = math.hypot(*sight.error_um) < 15 and abs(sight.error_rad) < 0.01
             wanted = self.options.stand_off_um if aligned and taught else _GATE_UM
             if sight.usable:
-                # One frame's depth is noisier than the stage: near the end the stage's own motion is trusted
-                # between frames, and each frame only corrects it.
-                surprise = sight.depth_um - depth_um
-                depth_um = depth_um + 0.3 * surprise if abs(surprise) < 8 else sight.depth_um
-                error = law.error(sight.hole_px, sight.desired_px, sight.centre_um, wanted - depth_um)
+                left_um = wanted - self._fused_depth_um(sight)
+                error = law.error(sight.hole_px, sight.desired_px, sight.centre_um, left_um)
                 command = law.command(error, quantiser.wake(error))
                 move = quantiser.move(command, now_s - last_s).array
             else:
@@ -695,7 +696,6 @@ class Assembly:
             codes = None if mask == self.eyes[0].mask else self._encoder.codes(mask)
             compute_ms = 1e3 * (time.perf_counter() - sight.begun)
             self._move(move)
-            depth_um += float(move[3])
             self._note("coarse", sight, wanted, command.array, compute_ms)
             self._change(mask, codes)
             if not sight.usable:
@@ -729,25 +729,24 @@ class Assembly:
         step_um = 12.0  # of z at a time: x and y keep up with the walk of half a degree
         inverse = np.linalg.inv(self._fine_px_per_um)
         resting = 0
-        mean_um, mean_z, count = np.zeros(2), 0.0, 0
+        mean_um, count = np.zeros(2), 0
         last_s = self.rig.clock.now_s - 1 / self.design.frame_rate_hz
         while resting < 6:
             sight = self._see()
             dt_s, last_s = self.rig.clock.now_s - last_s, self.rig.clock.now_s
             mask = self._next_mask()
             codes = None if mask == self.eyes[0].mask else self._encoder.codes(mask)
-            z_left = wanted_um - sight.depth_um
             clear = math.hypot(*sight.error_um) < 15
             if sight.usable:
+                z_left = wanted_um - self._fused_depth_um(sight)
                 # A running mean over up to eight frames: the stage is finer than one frame's noise.
                 count = min(count + 1, 8) if abs(z_left) < 2 * step_um else 1
                 mean_um += (sight.error_um - mean_um) / count
-                mean_z += (z_left - mean_z) / count
                 peg_px = self.stereo.camera_1.matrix_px_per_um[:, :2] @ -mean_um
                 move = inverse @ peg_px * (0.5 if count < 3 else 0.25)
-                dz = float(np.clip(0.5 * mean_z, -step_um, step_um)) if clear else 0.0
+                dz = float(np.clip(0.5 * z_left, -step_um, step_um)) if clear else 0.0
             else:
-                move, dz = np.zeros(2), 0.0
+                move, dz, z_left = np.zeros(2), 0.0, math.inf
             compute_ms = 1e3 * (time.perf_counter() - sight.begun)
             target = {"x": target["x"] + float(move[0]), "y": target["y"] + float(move[1])}
             fine.move_to(target)
@@ -755,12 +754,11 @@ class Assembly:
             mean_um -= np.linalg.solve(
                 self.stereo.camera_1.matrix_px_per_um[:, :2], -self._fine_px_per_um @ move
             )
-            mean_z -= dz
             self._move(np.array([0.0, 0.0, 0.0, dz]))
             self._note("fine" if wanted_um == self.options.stand_off_um else "insert", sight, wanted_um,
                        np.array([move[0], move[1], 0.0, dz]) / dt_s, compute_ms)  # fmt: skip
             self._change(mask, codes)
-            calm = sight.usable and count >= 6 and math.hypot(*mean_um) < tolerance_um and abs(mean_z) < 1.0
+            calm = sight.usable and count >= 6 and math.hypot(*mean_um) < tolerance_um and abs(z_left) < 0.5
             resting = resting + 1 if calm else 0
         fine.wait_until_still()
         self.rig.coarse.wait_until_still()
@@ -772,8 +770,8 @@ class Assembly:
         """
         self.rig.coarse.wait_until_still()
         self.rig.fine.wait_until_still()
-        self.take_templates(PEG, self.eyes[:1], self.drawings[PEG_OVER_HOLE])
-        self.take_templates(HOLE, self.eyes[:1], self.drawings[HOLE])
+        self.take_templates(PEG, (self.drawings[PEG_OVER_HOLE],))
+        self.take_templates(HOLE, (self.drawings[HOLE],))
         self._last_move_um = np.zeros(3)
         self.show(self._next_mask())
 
@@ -868,6 +866,21 @@ class Assembly:
             ssd_hole=float(np.mean([m.ssd for m in hole.measured])),
             ssd_peg=float(np.mean([m.ssd for m in peg.measured])),
         )
+
+    def _fused_depth_um(self, sight: _Sight) -> float:
+        """Return the depth from the z stage, tied to vision by the last frames.
+
+        The stage's steps are a thirtieth of one frame's depth noise: a running mean of what vision says of
+        the stage's zero is better than the last frame.
+        """
+        now_s, z_um = self.rig.clock.now_s, float(self.rig.coarse.position()["z"])
+        last_s, last_um = self._last_z or (now_s, z_um)
+        speed = (z_um - last_um) / (now_s - last_s) if now_s > last_s else 0.0
+        self._last_z = now_s, z_um
+        self._frames_fused = min(self._frames_fused + 1, _FUSED_FRAMES)
+        offset = sight.depth_um - (z_um - speed * (now_s - sight.frame.time_s))
+        self._depth_offset_um += (offset - self._depth_offset_um) / self._frames_fused
+        return self._depth_offset_um + z_um
 
     def _require_agreement(self) -> None:
         """Refuse to go on when vision and stage tell different stories of where the hole is.
