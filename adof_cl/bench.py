@@ -206,7 +206,7 @@ def measure(
 
     def built(who: str, builder: Builder) -> Contender | None:
         try:
-            contender = builder()
+            contender = builder(device)
         except Exception as failure:  # noqa: BLE001 (as in check: it is said, and the others go on)
             failures.append(Failure(case.name, who, sentence(failure)))
             return None
@@ -217,11 +217,11 @@ def measure(
         return contender
 
     case.prepare()
-    ours = built("adof-cl", lambda: case.ours(device))
+    ours = built("adof-cl", case.ours)
     if ours is None:
         return None, failures
     error = ours.error()
-    rivals = [built(name, make) for name, make in case.rivals(device, peers).items()]
+    rivals = [built(name, make) for name, make in case.rivals(peers).items()]
     present = [rival for rival in rivals if rival is not None]
     times = take_turns([ours.run, *(rival.run for rival in present)], rounds, clock)
     for contender in (ours, *present):
@@ -343,10 +343,13 @@ def run(
     load = os.getloadavg() if hasattr(os, "getloadavg") else None
     tell("copy bandwidth", "measuring")
     megabytes = 16 if quick else 256
-    copy = copy_bandwidth(device, megabytes, rounds)
+    copy = copy_bandwidth(device, megabytes, rounds if quick else Rounds(21, 61, 6.0))
     tell("copy bandwidth", f"{copy:.1f} GB/s")
     results, failures, asked = [], [], set()
     for case in cases:
+        if case.precision == "float64" and not device.facts.fp64:
+            tell(case.name, "left out: no float64 on this device")
+            continue
         first = None
         if not quick and (case.operation, case.form) not in asked:
             asked.add((case.operation, case.form))

@@ -204,11 +204,11 @@ def _restore_cases(size: Shape) -> Iterator[Case]:
         for n in padded_shape(size, 0):
             _axis(n)
 
-    def peers_of(device: Device, peers: Sequence[Peer]) -> dict[str, Builder]:
-        return {peer.name: partial(_restore_peer, peer, size, device) for peer in peers}
+    def peers_of(peers: Sequence[Peer]) -> dict[str, Builder]:
+        return {peer.name: partial(_restore_peer, peer, size) for peer in peers}
 
-    def own(device: Device, _peers: Sequence[Peer]) -> dict[str, Builder]:
-        return {"own float32": lambda: _restore_ours(device, size, "float32", "own float32")}
+    def own(_peers: Sequence[Peer]) -> dict[str, Builder]:
+        return {"own float32": partial(_restore_ours, size=size, kind="float32", name="own float32")}
 
     for kind, rivals in (("uint8", own), ("float32", peers_of), ("float64", peers_of)):
         yield Case(
@@ -220,6 +220,7 @@ def _restore_cases(size: Shape) -> Iterator[Case]:
             prepare,
             partial(_restore_ours, size=size, kind=kind),
             rivals,
+            "float64" if kind == "float64" else "float32",
         )
 
 
@@ -275,8 +276,8 @@ def _wiener_cases(size: Shape) -> Iterator[Case]:
             options={"precision": "float32", "family": _family(device), "padded": [nx, ny]},
         )
 
-    def frame_time(device: Device, _peers: Sequence[Peer]) -> dict[str, Builder]:
-        return {"own frame uint8": lambda: _restore_ours(device, size, "uint8", "own frame uint8")}
+    def frame_time(_peers: Sequence[Peer]) -> dict[str, Builder]:
+        return {"own frame uint8": partial(_restore_ours, size=size, kind="uint8", name="own frame uint8")}
 
     pixels = size[0] * size[1]
     yield Case("wiener", "from axes", size, pixels, "relative L2", prepare, axes)
@@ -286,7 +287,9 @@ def _wiener_cases(size: Shape) -> Iterator[Case]:
 # ---- otf and psf ----------------------------------------------------------------------------------------
 
 
-def _scipy_two_dimensional(samples: Shape, phase: Array, padded: int, peer: Peer) -> Contender:
+def _scipy_two_dimensional(
+    samples: Shape, phase: Array, padded: int, peer: Peer, _device: Device
+) -> Contender:
     """A pupil's PSF and OTF by two 2-D transforms in float32, two workers."""
     turned = phase.astype(np.float32)
     result: list[Array] = []
@@ -350,7 +353,7 @@ def _otf_cases(size: Shape) -> Iterator[Case]:
             options={"precision": "float32", "pairs": _PAIRS},
         )
 
-    def rivals(_device: Device, peers: Sequence[Peer]) -> dict[str, Builder]:
+    def rivals(peers: Sequence[Peer]) -> dict[str, Builder]:
         n = size[0]
         if size[0] != size[1] or n % 2:
             return {}
@@ -389,7 +392,7 @@ def _psf_cases(size: Shape) -> Iterator[Case]:
             options={"precision": "float32", "padded": [plan.size] * 2},
         )
 
-    def rivals(_device: Device, peers: Sequence[Peer]) -> dict[str, Builder]:
+    def rivals(peers: Sequence[Peer]) -> dict[str, Builder]:
         return {
             f"{peer.name} 2-D": partial(_scipy_two_dimensional, size, _phase(samples), 2 * samples, peer)
             for peer in peers
@@ -559,8 +562,8 @@ def _ssd_search_cases(size: Shape) -> Iterator[Case]:
             options = {"templates": count, "dtype": "uint8", "score": "ssd", "family": plan.family}
             return Contender("adof-cl", run, error, 0.0, traffic=traffic, options=options)
 
-        def rivals(_device: Device, peers: Sequence[Peer], count: int = count) -> dict[str, Builder]:
-            def opencv(peer: Peer) -> Contender:
+        def rivals(peers: Sequence[Peer], count: int = count) -> dict[str, Builder]:
+            def opencv(peer: Peer, _device: Device) -> Contender:
                 templates, origins = _templates(_frame(size), count)
                 search = _OpencvSearch(templates, origins)
                 wanted = _wanted_places(_frame(size), templates, origins)
@@ -624,10 +627,10 @@ def _chain_cases(size: Shape) -> Iterator[Case]:
             options={"dtype": "uint8", "precision": "float32", "family": _family(device), "templates": 4},
         )
 
-    def rivals(device: Device, peers: Sequence[Peer]) -> dict[str, Builder]:
+    def rivals(peers: Sequence[Peer]) -> dict[str, Builder]:
         opencv = any(peer.name == "opencv" for peer in peers)
 
-        def chain(peer: Peer) -> Contender:
+        def chain(peer: Peer, device: Device) -> Contender:
             import cv2
 
             made, chosen = _FILTERS.best(peer, size, device)

@@ -67,7 +67,7 @@ class Contender:
     options: dict[str, Any] = field(default_factory=dict)
 
 
-Builder = Callable[[], Contender]
+Builder = Callable[[Device], Contender]
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Case:
     ours
         Builds our contender on a device.
     rivals
-        Who takes turns with it, by name.
+        Who takes turns with it when these peers are there, by name.
     """
 
     operation: str
@@ -90,8 +90,9 @@ class Case:
     pixels: int
     measure: str
     prepare: Callable[[], object]
-    ours: Callable[[Device], Contender]
-    rivals: Callable[[Device, Sequence[Peer]], dict[str, Builder]] = lambda _device, _peers: {}
+    ours: Builder
+    rivals: Callable[[Sequence[Peer]], dict[str, Builder]] = lambda _peers: {}
+    precision: str = "float32"
 
     @property
     def name(self) -> str:

@@ -11,6 +11,8 @@ from adof_cl.cli.devices import DeviceOption
 
 if TYPE_CHECKING:
     from adof_cl.bench import Comparison, Report, Result
+    from adof_cl.peers import Peer
+    from adof_cl.turns import Case
 
 
 def bench(
@@ -43,15 +45,18 @@ def bench(
     import sys
 
     from adof_cl import bench as timing
+    from adof_cl import bench_cases
     from adof_cl.cli.progress import Live
     from adof_cl.device import Device
     from adof_cl.peers import installed
 
     old = timing.Report.read(compare) if compare is not None else None
-    cases = timing.select(_names(ops), timing.parse_sizes(sizes) if sizes else None, quick=quick)
+    cases = bench_cases.select(_names(ops), bench_cases.parse_sizes(sizes) if sizes else None, quick=quick)
     others = installed(peers)
     if plot is not None:
-        _require_drawable(plot)
+        _require_drawable(plot, cases, others)
+    for path in (as_file, plot):
+        _require_place(path)
     opened = Device.open(device)
     with Live(
         f"{opened.facts}: {len(cases)} cases, peers: {', '.join(p.name for p in others) or 'none'}"
@@ -163,11 +168,21 @@ def _print_changes(found: Comparison) -> None:
             print(f"  {title}: {', '.join(names)}")
 
 
-def _require_drawable(path: Path) -> None:
+def _require_drawable(path: Path, cases: list[Case], peers: list[Peer]) -> None:
     from adof_cl.errors import InputError
 
     if path.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise InputError(f"the plot's name is '{path.name}': one ending in .png, .svg or .pdf was wanted")
+    if not any(case.rivals(peers) for case in cases):
+        raise InputError("there is no ratio to draw: time some peers, or leave --plot out")
+
+
+def _require_place(path: Path | None) -> None:
+    """Refuse a folder that is not there now, not after minutes of timing."""
+    from adof_cl.errors import InputError
+
+    if path is not None and not path.parent.is_dir():
+        raise InputError(f"{path} cannot be written (no such folder): choose another place")
 
 
 def _draw(report: Report, path: Path) -> None:
@@ -175,12 +190,11 @@ def _draw(report: Report, path: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    from adof_cl.errors import InputError
     from adof_cl.files import whole_file
 
     compared = [result for result in report.results if result.peers]
-    if not compared:
-        raise InputError("there is no ratio to draw: time some peers, or leave --plot out")
+    if not compared:  # every peer failed, which is said
+        return
     names = _peer_names(compared)
     colours = {name: f"C{index}" for index, name in enumerate(names)}
     rows = sum(len(result.peers) for result in compared)
