@@ -526,7 +526,7 @@ class Assembly:
         points: list[list[float]] = []
         pixels: tuple[list[Array], list[Array]] = ([], [])
         covariances: tuple[list[Array], list[Array]] = ([], [])
-        # Down to where the peg's tip is 200 um away whatever x and y are: what is docked near is measured near.
+        # Down to where the peg's tip is 200 um away whatever x and y are: to dock near is to measure near.
         planes = np.linspace(depth, float(self.world[PEG][2]) + 500.0, 5)
         # About where the peg stands, leaning to the side on which camera 2 does not see the peg in front.
         middle = np.array([start["x"], start["y"]]) + (self.world[PEG] - self.world[HOLE])[:2]
