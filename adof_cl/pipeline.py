@@ -153,12 +153,14 @@ class CameraPipeline:
         Raises
         ------
         InputError
-            Another shape or type, or an unknown part.
+            Another shape or type, an unknown part, or one without an expected place; nothing is enqueued.
         TrackingError
             A part without templates.
         """
         for part in blurs:
             self.templates(part)
+            if part not in expected_xy_px:
+                raise InputError(f"part '{part}' has no expected place: give one for every part of blurs")
         self._enqueue(frame, blurs)
         for part, blur in blurs.items():
             tracker = self._trackers[part]

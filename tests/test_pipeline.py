@@ -226,3 +226,10 @@ def test_a_part_without_templates_is_refused_and_one_it_never_heard_of_too(devic
 def test_a_blur_of_no_depth_is_refused(depth_um: float) -> None:
     with pytest.raises(InputError, match="depth_um is"):
         Blur.of(Mask(20.0), OPTICS, depth_um)
+
+
+def test_a_part_without_an_expected_place_is_refused(device: Device) -> None:
+    pipeline = taught(device, 2500.0)
+    pixels, corners = frame(2500.0, joint(2500.0))
+    with pytest.raises(InputError, match="part 'hole' has no expected place"):
+        pipeline(pixels, {PEG: None, HOLE: None}, {PEG: corners[PEG]})
