@@ -363,6 +363,11 @@ def test_a_change_of_two_is_found_and_noise_is_not(device: Device) -> None:
     assert found.same_device
 
 
+def test_a_change_for_the_better_is_found_like_one_for_the_worse(device: Device) -> None:
+    found = compare(report(device, 2.0), report(device, 1.0))
+    assert [change.factor for change in found.changes] == [0.5]
+
+
 def test_a_ratio_that_moved_is_found_too(device: Device) -> None:
     found = compare(report(device, 1.0), report(device, 1.0, ratio_to=1.0))
     assert [(change.what, change.is_ratio) for change in found.changes] == [

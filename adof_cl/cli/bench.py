@@ -226,8 +226,6 @@ def _draw(report: Report, path: Path) -> None:
     axes.set_title(
         f"adof-cl {report.version} on {report.device['platform']}, {report.when[:10]}", fontsize=10
     )
-    axes.legend(
-        fontsize=8, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.08 - 1.2 / rows), frameon=False
-    )
+    figure.legend(fontsize=8, ncols=4, loc="outside lower center", frameon=False)
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=110)
