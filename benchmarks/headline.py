@@ -10,13 +10,13 @@ import sys
 from pathlib import Path
 
 from adof_cl.bench import Report, Result
+from adof_cl.turns import Spread
 
 TREE = Path(__file__).parents[1]
 MARK, END = "<!-- bench -->", "<!-- /bench -->"
 PEERS = {"pyfftw": "FFTW", "mkl_fft": "MKL", "scipy": "scipy.fft", "opencv": "OpenCV", "pyvkfft": "VkFFT"}
 CHOSEN = {
     ("restore", "float32"),
-    ("restore", "uint8"),
     ("ssd_search", "4 templates"),
     ("ssd_search", "16 templates"),
     ("chain", "4 searches"),
@@ -24,12 +24,18 @@ CHOSEN = {
 NAMES = {"ssd_search": "search,", "chain": "frame to places,"}
 
 
+def shown(ratio: Spread) -> str:
+    """With its quartiles where these are so far apart that the median alone would mislead."""
+    wide = ratio.high > 2 * ratio.low
+    return f"{ratio.median:.1f}" + (f" ({ratio.low:.1f}-{ratio.high:.1f})" if wide else "")
+
+
 def row(result: Result, peers: list[str]) -> str:
-    ratios = {peer.name: peer.ratio.median for peer in result.peers}
+    ratios = {peer.name: peer.ratio for peer in result.peers}
     name = (
         f"{NAMES.get(result.operation, result.operation)} {result.form}, {result.size[0]} × {result.size[1]}"
     )
-    cells = [f"{ratios[peer]:.1f}" if peer in ratios else "" for peer in peers]
+    cells = [shown(ratios[peer]) if peer in ratios else "" for peer in peers]
     wall = result.wall_s
     times = f"{1e3 * wall.median:.2f} ({1e3 * wall.low:.2f}-{1e3 * wall.high:.2f})"
     return f"| {name} | {times} | {result.per_s:.0f} | {' | '.join(cells)} |"
@@ -56,9 +62,11 @@ def block() -> str:
     reports = [Report.read(path) for path in sorted((TREE / "benchmarks" / "results").glob("*.json"))]
     introduction = (
         "`adof bench` checks every result against float64, then lets ours and other libraries take turns "
-        "in one process; a ratio above 1 means ours is faster. The machine was busy with other work: "
-        "its load, quartiles and versions are in [benchmarks/](benchmarks/README.md)."
+        "in one process; a ratio above 1 means ours is faster. The machine had other work "
+        "to do, which troubles threads that wait for each other (FFTW's most); brackets are quartiles. "
+        "[benchmarks/](benchmarks/README.md) says how it was measured and keeps every number."
     )
+    reports.sort(key=lambda report: report.device["platform"] != "Portable Computing Language")  # the default
     return "\n\n".join([MARK, introduction, *(table(report) for report in reports), END])
 
 
