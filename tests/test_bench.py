@@ -424,5 +424,5 @@ def test_restore_beats_the_plain_route_of_the_same_transforms(device: Device) ->
     assert best > LEAST_GAIN
 
 
-LEAST_GAIN = 6.0
-"""Half of what is measured."""
+LEAST_GAIN = 10.0
+"""Measured on two cores: 27 on PoCL, 21 on Intel's runtime."""

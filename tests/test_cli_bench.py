@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import runpy
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from adof_cl import bench as timing
-from adof_cl import bench_cases, reference
+from adof_cl import reference
 from adof_cl.bench_cases import OPERATIONS
 from adof_cl.cli import main
 from adof_cl.device import Device
@@ -115,5 +116,20 @@ def test_a_place_that_cannot_be_written_is_refused_before_anything_is_timed(
     assert "no/r.json" in capsys.readouterr().err
 
 
-def test_sizes_in_the_help_are_those_it_takes() -> None:
-    assert bench_cases.parse_sizes("512x400,1024x1024") == [(400, 512), (1024, 1024)]
+def test_readme_holds_the_table_of_the_results_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    script = Path(__file__).parents[1] / "benchmarks" / "headline.py"
+    monkeypatch.setattr("sys.argv", [str(script), "--check"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(script), run_name="__main__")
+    assert ended.value.code == 0
+
+
+def test_every_result_kept_is_right_and_says_where_it_was_measured() -> None:
+    kept = sorted((Path(__file__).parents[1] / "benchmarks" / "results").glob("*.json"))
+    assert kept
+    for path in kept:
+        report = timing.Report.read(path)
+        assert not report.failures
+        assert not report.settings["quick"]
+        assert report.device["driver_version"]
+        assert report.machine["load_at_start"]
