@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from adof_cl.autofocus import focus_sweep
 from adof_cl.device import Device
-from adof_cl.errors import AdofError, TrackingError
+from adof_cl.errors import AdofError, InputError, TrackingError
 from adof_cl.mask import ModelCalibration, PaperCalibration, choose_mask
 from adof_cl.optics import Mask, OpticalSystem, SlmPanel
 from adof_cl.pipeline import Blur, CameraPipeline
@@ -148,6 +148,9 @@ class Design(Protocol):
     def projection(self, camera: int) -> tuple[Array, Array]: ...  # noqa: D102
 
 
+MASKS = ("joint", "paper", "fixed")
+
+
 @dataclass(frozen=True)
 class Options:
     """What an operator may choose.
@@ -176,6 +179,15 @@ class Options:
     nsr: float = 0.01
     iteration_limit: int = 600
     rig_name: str = "rig"
+
+    def __post_init__(self) -> None:
+        if self.mask not in MASKS:
+            raise InputError(f"mask is '{self.mask}': choose one of {', '.join(MASKS)}")
+
+    @property
+    def camera_ids(self) -> tuple[str, str]:
+        """Names of both cameras in a calibration file."""
+        return f"{self.rig_name} camera 1", f"{self.rig_name} camera 2"
 
 
 # Opposite corners: whatever blurs a corner moves both alike about the part's middle.
@@ -230,9 +242,8 @@ class Features:
 class _Eye:
     """One camera as the loop uses it: its pipeline, its drawn geometry, the mask its light passes."""
 
-    def __init__(self, number: int, camera: Camera, device: Device, design: Design, nsr: float) -> None:
+    def __init__(self, number: int, device: Device, design: Design, nsr: float) -> None:
         self.number = number
-        self.camera = camera
         self.optics = design.optics_1 if number == 1 else design.optics_2
         self.pipeline = CameraPipeline(
             device, self.optics, (design.region_rows, design.region_columns), (PEG, HOLE), nsr=nsr
@@ -313,8 +324,8 @@ class Assembly:
         self._reached = milestone or (lambda _stage: None)
         self._encoder = SlmEncode(device, design.panel, design.optics_1)
         self.eyes = (
-            _Eye(1, rig.camera_1, device, design, self.options.nsr),
-            _Eye(2, rig.camera_2, device, design, self.options.nsr),
+            _Eye(1, device, design, self.options.nsr),
+            _Eye(2, device, design, self.options.nsr),
         )
         self._model = ModelCalibration(design.optics_1)
         self._calibration = PaperCalibration()
@@ -370,11 +381,6 @@ class Assembly:
         finally:
             self.rig.coarse.stop()
             self.rig.fine.stop()
-
-    @property
-    def camera_ids(self) -> tuple[str, str]:
-        """Names of both cameras in a calibration file."""
-        return f"{self.options.rig_name} camera 1", f"{self.options.rig_name} camera 2"
 
     def prepare(self, known: StereoRig | None = None) -> None:
         """Find, focus, learn and calibrate: everything before the first servo step."""
@@ -561,7 +567,7 @@ class Assembly:
                 work_volume_um=volume,
                 camera_id=camera_id,
             )
-            for k, camera_id in enumerate(self.camera_ids)
+            for k, camera_id in enumerate(self.options.camera_ids)
         ]
         stereo = StereoRig(cameras[0], cameras[1])
         sigma_z = stereo.sigma_z_um()

@@ -44,8 +44,8 @@ class Rehearsal:
             HOLE: drawing_of(rig.design.hole),
         }
         record = RunRecord(seed, str(device.facts))
-        truth = Truth(rig, record)
         options = Options(rig_name=f"twin {seed}")
+        truth = Truth(rig, record, options)
         assembly = Assembly(device, rig, rig.design, drawings, record, options=options)
         made = cls(rig, assembly, record, truth)
         made.listen()
@@ -104,7 +104,7 @@ class Rehearsal:
         assembly._shown = False
         record = RunRecord(self.record.seed, self.record.device)
         assembly.record = record
-        self.truth = Truth(self.rig, record)
+        self.truth = Truth(self.rig, record, assembly.options)
         self.events.clear()
         self.listen()
         return record

@@ -21,11 +21,10 @@ from adof_cl.cli.devices import DeviceOption
 from adof_cl.errors import AdofError, InputError
 
 if TYPE_CHECKING:
+    from adof_cl.loop import Options
     from adof_cl.record import Iteration, RunRecord
     from adof_cl.survey import ArmResult
     from adof_cl.twin import Twin
-
-MASKS = ("joint", "paper", "fixed")
 
 
 def run(
@@ -61,9 +60,6 @@ def run(
 
     Examples: adof run | adof run --seed 7 --out seven --compare | ADOF_DEVICE=cpu adof run --json
     """
-    if mask not in MASKS:
-        raise InputError(f"mask is '{mask}': choose one of {', '.join(MASKS)}")
-
     from adof_cl import twin as twins
     from adof_cl.calibration_file import load_rig, save_calibration
     from adof_cl.cli.progress import Live
@@ -73,9 +69,8 @@ def run(
     from adof_cl.survey import survey
     from adof_cl.twin.parts import drawing_of
 
-    rig_name = f"twin {seed}"
-    ids = (f"{rig_name} camera 1", f"{rig_name} camera 2")
-    known = None if calibration is None else load_rig(calibration, camera_ids=ids)
+    options = Options(mask=mask, rig_name=f"twin {seed}")
+    known = None if calibration is None else load_rig(calibration, camera_ids=options.camera_ids)
     opened = Device.open(device)
     folder = _folder(out, seed)
     begun = time.perf_counter()
@@ -83,7 +78,7 @@ def run(
     for camera in (twin.camera_1, twin.camera_2):
         camera.set_centred_region()
     record = RunRecord(seed, str(opened.facts))
-    truth = Truth(twin, record)
+    truth = Truth(twin, record, options)
     arms: list[ArmResult] = []
     refusal = ""
     try:
@@ -100,7 +95,7 @@ def run(
                 twin.design,
                 drawings,
                 record,
-                options=Options(mask=mask, rig_name=rig_name),
+                options=options,
                 progress=live.tell,
                 observer=truth.observe,
                 milestone=truth.reached,
@@ -131,14 +126,15 @@ def run(
 class Truth:
     """Adds to the record what only the twin's world knows; the loop never sees it."""
 
-    def __init__(self, twin: Twin, record: RunRecord) -> None:
+    def __init__(self, twin: Twin, record: RunRecord, options: Options) -> None:
         self._twin = twin
+        self._options = options
         self._record = record
         self._origin_xy = np.array(twin.design.region_origin_yx[::-1], dtype=np.float64)
 
     def hole_px(self, time_s: float) -> NDArray[np.float64]:
         """Return where the hole's middle is seen by camera 1, region of interest, (x, y)."""
-        corners = self._twin.world.corners_px(1, HOLE_NAME, time_s)
+        corners = self._twin.world.corners_px(1, "hole", time_s)
         return np.asarray(corners.mean(axis=0) - self._origin_xy)
 
     def observe(self, iteration: Iteration, time_s: float) -> Iteration:
@@ -172,20 +168,15 @@ class Truth:
             self._record.end_state += "; the parts touched"
 
     def _errors(self) -> dict[str, float]:
-        from adof_cl.loop import Options
-
         truth = self._twin.world.truth()
         stage = self._record.iterations[-1].stage if self._record.iterations else "coarse"
-        wanted = Options().seat_um if stage == "insert" else Options().stand_off_um
+        wanted = self._options.seat_um if stage == "insert" else self._options.stand_off_um
         return {
             "x": truth.offset_um[0],
             "y": truth.offset_um[1],
             "z": truth.depth_um - wanted,
             "theta": truth.offset_rad,
         }
-
-
-HOLE_NAME = "hole"
 
 
 def _folder(out: Path | None, seed: int) -> Path:
