@@ -227,12 +227,15 @@ class Device:
     ----------
     events
         None, or a list to which every launch adds its event: set one on a profiling device to time kernels.
+    vector_bytes
+        What `program.vector_bytes` found, once it was asked.
     """
 
     def __init__(self, facts: DeviceFacts, handle: cl.Device, *, profiling: bool = False) -> None:
         self.facts = facts
         self.handle = handle
         self.events: list[cl.Event] | None = None
+        self.vector_bytes: int | None = None
         self.context = cl.Context([handle])
         self._kept: list[cl.Buffer] = []
         if profiling:

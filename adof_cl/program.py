@@ -260,6 +260,37 @@ def _store(path: Path, binary: bytes) -> None:
         warnings.warn(f"compiled kernels could not be kept in {path.parent}: {failure}", stacklevel=2)
 
 
+_VECTOR_BYTES = """\
+__kernel void vector_bytes(__global int *bytes)
+{
+#if defined(__AVX512F__)
+    bytes[0] = 64;
+#elif defined(__AVX__)
+    bytes[0] = 32;
+#elif defined(__SSE2__) || defined(__ARM_NEON)
+    bytes[0] = 16;
+#else
+    bytes[0] = 0;
+#endif
+}
+"""
+
+
+def vector_bytes(device: Device) -> int:
+    """Return the width of the vectors a lanes kernel should use on this device: 16, 32 or 64 bytes.
+
+    A device reports what its processor has; its compiler may be older and use half of it, and then vectors
+    of the full width do not fit the registers. The compiler's own word goes before the device's.
+    """
+    if device.vector_bytes is None:
+        program = Program(device, "precision.h", generated=("vector_bytes.cl", _VECTOR_BYTES))
+        said = device.empty((1,), np.int32)
+        program.launch("vector_bytes", (1,), (1,), said)()
+        widest = int(said.download()[0]) or device.facts.vector_bytes
+        device.vector_bytes = max(size for size in (16, 32, 64) if size <= max(widest, 16))
+    return device.vector_bytes
+
+
 def require_local_memory(device: Device, wanted_bytes: int, what: str) -> None:
     """Refuse a launch that needs more local memory than the device has.
 

@@ -166,3 +166,16 @@ def test_the_wrong_number_of_arguments_is_refused(device: Device) -> None:
     built = Program(device, "square.cl", {"SCALE": 1})
     with pytest.raises(InputError, match="takes 1 arguments, 0 came"):
         built.launch("square", (1,), None)
+
+
+def test_vectors_are_no_wider_than_the_registers_the_compiler_uses(device: Device) -> None:
+    width = program_module.vector_bytes(device)
+    assert width in (16, 32, 64)
+    probe = """
+    #if (VECTOR_BYTES > 32 && defined(__AVX__) && !defined(__AVX512F__)) \\
+        || (VECTOR_BYTES > 16 && defined(__SSE2__) && !defined(__AVX__))
+    #error "this width does not fit the registers"
+    #endif
+    """
+    Program(device, "precision.h", {"VECTOR_BYTES": width}, generated=("probe.cl", probe))
+    assert width <= max(16, device.facts.vector_bytes)
