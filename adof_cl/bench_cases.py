@@ -254,13 +254,12 @@ def _wiener_cases(size: Shape) -> Iterator[Case]:
         plan = _restore_plan(device, size, "float32")
         ny, nx = plan.padded_shape
         optics = OpticalSystem()
-        plans = [Otf1d(device, optics.frequency_axis(n)) for n in (ny, nx)]
+        otf = Otf1d(device, np.concatenate([optics.frequency_axis(n) for n in (ny, nx)]))
         frame = device.upload(_frame(size).astype(np.float32))
         out = device.empty(size, np.float32)
 
         def run() -> None:
-            h_rows, h_columns = (plan([(ALPHA_RAD, PSI_RAD)]) for plan in plans)
-            plan.set_filter_axes_device(h_rows, h_columns, NSR)
+            plan.set_filter_table(otf([(ALPHA_RAD, PSI_RAD)]), NSR)
             device.wait()
 
         def error() -> float:

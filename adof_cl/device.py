@@ -42,6 +42,8 @@ class DeviceFacts:
         A simulator or an FPGA emulator: correct, slow, and never chosen unless asked for by name or index.
     vector_bytes
         Width of the device's native float vector.
+    cache_bytes
+        The device's largest cache for global memory; 0: none it would tell of.
     """
 
     index: int
@@ -57,6 +59,7 @@ class DeviceFacts:
     max_allocation_bytes: int
     max_work_group_size: int
     vector_bytes: int
+    cache_bytes: int
     simulated: bool
 
     def as_dict(self) -> dict[str, Any]:
@@ -97,6 +100,7 @@ def _facts(index: int, platform: cl.Platform, device: cl.Device) -> DeviceFacts:
         max_allocation_bytes=int(device.max_mem_alloc_size),
         max_work_group_size=int(device.max_work_group_size),
         vector_bytes=4 * max(1, int(device.native_vector_width_float)),
+        cache_bytes=int(device.global_mem_cache_size),
         simulated=simulated,
     )
 

@@ -14,28 +14,51 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-# Vector operations per sample of each small transform, counted from restore_butterflies.h; a pass adds its
-# twiddles, loads and stores.
-_OPERATIONS = {2: 2, 3: 5.3, 4: 4, 5: 7.2, 6: 7.3, 7: 9.4, 8: 7, 9: 12.4, 10: 9.2, 12: 9.3, 15: 12.5}
-_PASS_COST = 8.0
+# What a pass costs for each sample, by radix: with its turns, and as the last pass, which has none.
+#
+# In vectors: nanoseconds measured on one core, the samples in its nearest cache: PoCL with 16 registers,
+# Intel's runtime with 32. Larger radices lose what they save where their samples do not fit the registers.
+# In scalars: operations counted from restore_butterflies.h, and eight for a pass's loads, stores and turns.
+_COSTS: dict[int, dict[int, tuple[float, float]]] = {
+    16: {
+        2: (0.54, 0.54), 3: (0.77, 0.55), 4: (0.70, 0.54), 5: (1.18, 0.75), 6: (1.06, 0.72), 7: (1.85, 1.27),
+        8: (1.44, 0.91), 9: (2.01, 1.58), 10: (1.95, 1.31), 12: (1.94, 1.26), 15: (2.25, 1.54),
+    },
+    32: {
+        2: (1.10, 0.61), 3: (1.49, 1.12), 4: (1.38, 1.09), 5: (2.01, 1.30), 6: (1.96, 1.45), 7: (2.68, 1.90),
+        8: (1.98, 1.76), 9: (2.56, 1.85), 10: (2.63, 1.66), 12: (2.89, 1.99), 15: (4.19, 2.26),
+    },
+    0: {
+        radix: (operations + 8, operations + 8)
+        for radix, operations in (
+            (2, 2), (3, 5.3), (4, 4), (5, 7.2), (6, 7.3), (7, 9.4), (8, 7), (9, 12.4), (10, 9.2), (12, 9.3),
+            (15, 12.5),
+        )
+    },
+}  # fmt: skip
 
 
 @cache
-def radices_of(n: int) -> tuple[int, ...]:
-    """Split a transform into the passes that cost least, largest first."""
+def radices_of(n: int, registers: int = 0) -> tuple[int, ...]:
+    """Split a transform into the passes that cost least: the largest first, but for the last.
+
+    Composite lengths get two passes at least: what is done to the first is not done to the last.
+    """
+    costs = _COSTS[registers]
 
     @cache
-    def best(rest: int, largest: int) -> tuple[float, tuple[int, ...]]:
-        if rest == 1:
-            return 0.0, ()
+    def best(rest: int) -> tuple[float, tuple[int, ...]]:
         found: tuple[float, tuple[int, ...]] = (math.inf, ())
-        for radix, operations in _OPERATIONS.items():
-            if radix <= largest and rest % radix == 0:
-                cost, tail = best(rest // radix, radix)
-                found = min(found, (cost + operations + _PASS_COST, (radix, *tail)))
+        for radix, (turned, last) in costs.items():
+            if rest == radix and (rest < n or n in (2, 3, 5, 7)):
+                found = min(found, (last, (radix,)))
+            elif rest % radix == 0 and rest > radix:
+                cost, tail = best(rest // radix)
+                found = min(found, (turned + cost, (radix, *tail)))
         return found
 
-    return best(n, max(_OPERATIONS))[1]
+    *others, last = best(n)[1] or (1,)
+    return (*sorted(others, reverse=True), last) if n > 1 else ()
 
 
 @dataclass(frozen=True)
@@ -54,9 +77,15 @@ class Passes:
     radices: tuple[int, ...]
 
     @classmethod
-    def of(cls, length: int) -> Passes:
-        """Choose the passes of a length whose prime factors are 2, 3, 5 and 7."""
-        return cls(length, radices_of(length))
+    def of(cls, length: int, registers: int = 0) -> Passes:
+        """Choose the passes of a length whose prime factors are 2, 3, 5 and 7.
+
+        Parameters
+        ----------
+        registers
+            How many vectors the registers hold, 16 or 32; 0: scalars.
+        """
+        return cls(length, radices_of(length, registers))
 
     def passes(self) -> list[tuple[int, int, int]]:
         """Return (radix, stride, offset of its twiddles in `turns`) of each pass."""
@@ -93,19 +122,22 @@ class Passes:
 
 
 def pass_lists(row: Passes, column: Passes) -> str:
-    """Write the passes as macro lists: C can loop over them only if the radix is a literal."""
+    """Write the passes as macro lists: C can loop over them only if the radix is a literal.
+
+    Of each axis: the first pass, those between (forward and, BACK, in reverse) and the last; and the length
+    of the parts the first pass leaves, each of which the others transform by itself.
+    """
 
     def listed(name: str, passes: Sequence[tuple[int, int, int]]) -> str:
         return f"#define {name}(P) " + " ".join(f"P({r}, {m}, {t})" for r, m, t in passes)
 
-    rows, columns = row.passes(), column.passes()
-    return "\n".join(
-        [
-            listed("ROW_PASSES", rows),
-            listed("ROW_PASSES_BACK", rows[::-1]),
-            listed("COLUMN_PASSES", columns[:-1]),
-            listed("COLUMN_PASSES_BACK", columns[-2::-1]),
-            f"#define COLUMN_LAST(P) P({columns[-1][0]})",
-            "",
+    lines = []
+    for name, axis in (("ROW", row.passes()), ("COLUMN", column.passes())):
+        lines += [
+            listed(f"{name}_FIRST", axis[:1]),
+            listed(f"{name}_MIDDLE", axis[1:-1]),
+            listed(f"{name}_MIDDLE_BACK", axis[-2:0:-1]),
+            listed(f"{name}_LAST", axis[-1:]),
+            f"#define {name}_INNER {axis[0][1]}",
         ]
-    )
+    return "\n".join([*lines, ""])

@@ -90,15 +90,9 @@ class CameraPipeline:
         self.nsr = nsr
         self._search_shape = search_shape
         self._restore = Restore(device, shape, in_dtype=np.uint8, out_dtype=np.uint8, padding=padding)
-        rows, columns = self._restore.padded_shape
         # The pixel's own transfer stays in the image, as it is in the templates.
-        self._otf = {
-            part: (
-                Otf1d(device, optics.frequency_axis(rows)),
-                Otf1d(device, optics.frequency_axis(columns)),
-            )
-            for part in self.parts
-        }
+        axes = np.concatenate([optics.frequency_axis(n) for n in self._restore.padded_shape])
+        self._otf = {part: Otf1d(device, axes) for part in self.parts}
         self._frame = device.empty(shape, np.uint8)
         self._images = {part: device.empty(shape, np.uint8) for part in self.parts}
         self._trackers: dict[str, TemplateTracker] = {}
@@ -189,9 +183,8 @@ class CameraPipeline:
                 continue
             slot = self.parts.index(part)
             if not blur.near(self._blurs.get(part)):
-                pair = [(blur.alpha_rad, blur.psi_rad)]
-                h_rows, h_columns = (plan(pair) for plan in self._otf[part])
-                self._restore.set_filter_axes_device(h_rows, h_columns, self.nsr, slot)
+                table = self._otf[part]([(blur.alpha_rad, blur.psi_rad)])
+                self._restore.set_filter_table(table, self.nsr, slot)
                 self._blurs[part] = blur
             self._restore.apply(self._images[part], slot)
 

@@ -110,6 +110,11 @@ class Launch:
         value = argument.buffer if isinstance(argument, DeviceArray) else argument
         self._kernel.set_arg(index, value)
 
+    def update(self, arguments: Mapping[int, Argument]) -> None:
+        """Replace several arguments, by index, from the next call on."""
+        for index, argument in arguments.items():
+            self.set(index, argument)
+
     def __call__(self) -> cl.Event:
         """Enqueue on the device's in-order queue and return the event."""
         event = cl.enqueue_nd_range_kernel(

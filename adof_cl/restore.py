@@ -3,7 +3,8 @@
 One plan holds everything for one frame size: programs, tables, spectra, and as many filters as the caller
 keeps in slots. A call only enqueues. Two kernel families do the same arithmetic (docs/maths.md, section 4):
 *lanes* for CPUs, where a work-item owns one row or column per SIMD lane and nothing waits for anything, and
-*groups* for GPUs, where a work-group shares a pair of rows or a block of columns in local memory.
+*groups* for GPUs, where a work-group shares a pair of rows or a block of columns in local memory. Lanes
+transforms columns, rows, columns; groups rows, columns, rows: the outer axis twice, the inner one once.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from adof_cl.errors import InputError
 from adof_cl.fft_passes import Passes, pass_lists
 from adof_cl.noise import checked_nsr
 from adof_cl.padding import checked_frame_shape, padded_shape, padding_weights
-from adof_cl.program import Program
+from adof_cl.program import Program, vector_bytes
 
 FAMILIES = ("lanes", "groups")
 
@@ -32,36 +33,61 @@ class _Cut:
 
     Attributes
     ----------
-    block, blocks
-        Columns per block of the spectrum, and blocks.
-    held
-        Rows of the spectrum.
-    row_groups, row_items, column_items
-        Work-groups for the rows, and work-items in each group; columns have one group per block.
-    run
-        Columns a work-item of the filter kernels forms.
-    row_scratch, column_scratch
+    half_rows
+        Which axis of a frame is transformed first, so that half of its frequencies are held: the columns' (so
+        that rows of the spectrum are), or the rows'.
+    block, shorts
+        Frequencies of that axis in a block, and in all blocks.
+    spectrum
+        Shape of the spectrum, in reals.
+    outer, outer_items, inner_items
+        Work-groups of the first and the last kernel, and work-items in each group; the middle one has a group
+        for each block.
+    outer_scratch, inner_scratch
         Extra buffers a family's kernels take, in reals; 0: none is needed.
     """
 
+    half_rows: bool
     block: int
-    blocks: int
-    held: int
-    row_groups: int
-    row_items: int
-    column_items: int
-    run: int
+    shorts: int
+    spectrum: tuple[int, ...]
+    outer: int
+    outer_items: int
+    inner_items: int
     defines: dict[str, int]
-    row_scratch: tuple[int, ...] = ()
-    column_scratch: tuple[int, ...] = ()
+    outer_scratch: tuple[int, ...] = ()
+    inner_scratch: tuple[int, ...] = ()
 
 
-def _lanes(rows: int, nx: int, real_bytes: int) -> _Cut:
-    """Divide for SIMD lanes: 64 bytes of columns, or of pairs of rows, to a work-item."""
-    lanes = 64 // real_bytes
-    row_groups = -(-rows // (2 * lanes))
-    blocks = -(-(nx // 2 + 1) // lanes)
-    return _Cut(lanes, blocks, row_groups * 2 * lanes, row_groups, 1, 1, lanes, {})
+@dataclass
+class _Filter:
+    """A slot: a filter formed as it is applied, from two axes and one level of noise, or a stored one."""
+
+    formed: bool = False
+    nsr: float = 0.0
+    long_axis: DeviceArray | None = None
+    short_axis: DeviceArray | None = None
+    stored: DeviceArray | None = None
+
+
+def _lanes(
+    shape: tuple[int, int], padded: tuple[int, int], real_bytes: int, vector: int, moved: float, line: int
+) -> _Cut:
+    """Divide for SIMD lanes: two vectors of columns, or one of their frequencies, to a work-item.
+
+    `moved` is the memory the kernels go through, in caches; `line` the bytes of a row of the image.
+    """
+    lanes = vector // real_bytes
+    strips, held = -(-shape[1] // (2 * lanes)), padded[0] // 2 + 1
+    slots = -(-held // lanes) * lanes
+    whole_lines = line % 64 == 0 and line // strips % 64 == 0 and shape[1] == strips * 2 * lanes
+    return _Cut(
+        True, lanes, slots, (strips, slots, 4, lanes), strips, 1, 1,
+        {
+            "VECTOR_BYTES": vector, "STRIPS": strips, "HELD": held, "SLOTS": slots,
+            "STREAM_IMAGE": int(moved > 1 and whole_lines),
+        },
+    )  # fmt: skip
 
 
 def _groups(rows: int, padded: tuple[int, int], real_bytes: int, local_bytes: int, most_items: int) -> _Cut:
@@ -82,15 +108,16 @@ def _groups(rows: int, padded: tuple[int, int], real_bytes: int, local_bytes: in
     while 2 * items <= min(256, most_items, max(nx, ny) // 4):
         items *= 2
     block = min(block, items)
-    row_groups, blocks = -(-rows // 2), -(-(nx // 2 + 1) // block)
+    pairs, blocks = -(-rows // 2), -(-(nx // 2 + 1) // block)
     return _Cut(
-        block, blocks, 2 * row_groups, row_groups, items, items, 1,
+        False, block, blocks * block, (blocks, 2 * pairs, 2, block), pairs, items, items,
         {
+            "HELD": 2 * pairs, "BLOCKS": blocks,
             "BLOCK": block, "ROW_ITEMS": items, "COLUMN_ITEMS": items,
             "ROW_LOCAL": int(row_local), "COLUMN_LOCAL": int(column_local),
         },
-        row_scratch=(0 if row_local else row_groups * 2 * nx,),
-        column_scratch=(0 if column_local else blocks * 2 * ny * block,),
+        outer_scratch=(0 if row_local else pairs * 2 * nx,),
+        inner_scratch=(0 if column_local else blocks * 2 * ny * block,),
     )  # fmt: skip
 
 
@@ -116,6 +143,10 @@ class Restore:
     taper
         True: the padding passes smoothly from the far edge to the near one. False: it replicates them, half
         each, and steps in the middle.
+    spectrum_dtype
+        What the spectrum is kept in between the kernels: the precision's own type, or float16 for uint8 and
+        uint16 frames in float32. Half the memory to move, relative L2 errors below 3e-3 instead of 5e-7, and
+        at most three of 255 grey levels.
     family
         "lanes" or "groups"; by default lanes on a CPU, groups elsewhere.
 
@@ -146,32 +177,47 @@ class Restore:
         out_dtype: DTypeLike = np.float32,
         padding: int | tuple[int, int] = 0,
         taper: bool = True,
+        spectrum_dtype: DTypeLike | None = None,
         family: str | None = None,
     ) -> None:
         self.device = device
         self.shape = checked_frame_shape(shape)
         self.padded_shape = padded_shape(shape, padding)
         self._real = device.real_type(precision)
+        self.spectrum_dtype = np.dtype(spectrum_dtype or self._real)
+        if self.spectrum_dtype != self._real and (
+            self.spectrum_dtype != np.float16 or self._real == np.float64
+        ):
+            raise InputError(
+                f"spectrum_dtype is {self.spectrum_dtype}: {self._real}, or float16 with float32, was wanted"
+            )
         self._complex = np.dtype(np.result_type(self._real, np.complex64))
         self.in_dtype = _checked_dtype("in_dtype", in_dtype, self._real)
         self.out_dtype = _checked_dtype("out_dtype", out_dtype, self._real)
+        if self.spectrum_dtype == np.float16 and self.in_dtype.kind != "u":
+            raise InputError(
+                f"spectrum_dtype is float16 and in_dtype {self.in_dtype}: half numbers end at 65504, so "
+                "uint8 or uint16 frames were wanted"
+            )
         self.family = family or ("lanes" if device.facts.kind == "cpu" else "groups")
         if self.family not in FAMILIES:
             raise InputError(f"family is '{family}': choose 'lanes' or 'groups'")
 
         ny, nx = self.padded_shape
-        row, column = Passes.of(nx), Passes.of(ny)
         facts, real_bytes = device.facts, self._real.itemsize
+        vector = vector_bytes(device) if self.family == "lanes" else 0
+        registers = {0: 0, 64: 32}.get(vector, 16)
+        rows, columns = Passes.of(nx, registers), Passes.of(ny, registers)
         if self.family == "lanes":
-            cut = _lanes(self.shape[0], nx, real_bytes)
+            pixel_bytes = self.in_dtype.itemsize + self.out_dtype.itemsize + self.spectrum_dtype.itemsize
+            moved = pixel_bytes * self.shape[0] * self.shape[1] / max(facts.cache_bytes, 1)
+            line = self.out_dtype.itemsize * self.shape[1]
+            cut = _lanes(self.shape, self.padded_shape, real_bytes, vector, moved, line)
+            outer, inner, names = columns, rows, ("columns", "rows")
         else:
-            cut = _groups(
-                self.shape[0],
-                self.padded_shape,
-                real_bytes,
-                facts.local_memory_bytes,
-                facts.max_work_group_size,
-            )
+            local, most = facts.local_memory_bytes, facts.max_work_group_size
+            cut = _groups(self.shape[0], self.padded_shape, real_bytes, local, most)
+            outer, inner, names = rows, columns, ("rows", "columns")
         program = Program(
             device,
             f"restore_{self.family}.cl",
@@ -181,61 +227,78 @@ class Restore:
                 "COLS": self.shape[1],
                 "NX": nx,
                 "NY": ny,
-                "HELD": cut.held,
-                "BLOCKS": cut.blocks,
+                "HALF_SPECTRUM": self.spectrum_dtype == np.float16,
+                "STORED_LEVEL": 256
+                if self.spectrum_dtype == np.float16 and self.in_dtype == np.uint16
+                else 1,
                 **_io_defines(self.in_dtype, self.out_dtype),
                 # A simulator checks every value's origin, and loses it in a compiler's own shuffles.
-                "RESTORE_PORTABLE": facts.simulated,
+                "PORTABLE": facts.simulated,
                 **cut.defines,
             },
-            generated=("restore_passes.h", pass_lists(row, column)),
+            generated=("restore_passes.h", pass_lists(rows, columns)),
         )
 
-        frequency = np.arange(cut.blocks * cut.block)
-        frequency[frequency > nx // 2] = 0
-        place = row.position()
-        places = device.upload(np.stack([place[frequency], place[(nx - frequency) % nx]]))
-        self._order = device.upload(column.order())
-        self._spectrum = device.empty((cut.blocks, cut.held, 2, cut.block), self._real)
-        row_turns, column_turns = self._table(row.turns()), self._table(column.turns())
-        row_blend = self._table(padding_weights(nx - self.shape[1], taper))
-        column_blend = self._table(padding_weights(ny - self.shape[0], taper))
-        self._filter_shape = (cut.blocks, ny, 2, cut.block)
-        self._filters: dict[int, DeviceArray] = {}
-
-        rows, columns = (cut.row_groups * cut.row_items,), (cut.blocks * cut.column_items,)
-        row_items, column_items = (cut.row_items,), (cut.column_items,)
-        row_scratch = [self._scratch(n) for n in cut.row_scratch]
-        column_scratch = [self._scratch(n) for n in cut.column_scratch]
-        self._rows_forward = program.launch(
-            "restore_rows_forward", rows, row_items,
-            None, self._spectrum, places, row_turns, row_blend, *row_scratch,
+        # Frequencies stand in the order the outer passes leave them in.
+        held, place = outer.length // 2 + 1, outer.position()
+        frequency = np.full(cut.shorts, -1, dtype=np.int32)
+        frequency[:held] = np.argsort(place[:held])
+        known = np.maximum(frequency, 0)
+        places = device.upload(np.stack([place[known], place[(outer.length - known) % outer.length]]))
+        self._spectrum = device.empty(cut.spectrum, self.spectrum_dtype)
+        blends = [
+            self._table(padding_weights(p - n, taper)) for p, n in zip((ny, nx), self.shape, strict=True)
+        ]
+        outer_blend, inner_blend = blends if cut.half_rows else blends[::-1]
+        outer_turns, inner_turns = self._table(outer.turns()), self._table(inner.turns())
+        i32, zero = np.int32, self._real.type(0)
+        outer_size, outer_group = (cut.outer * cut.outer_items,), (cut.outer_items,)
+        inner_size, inner_group = (cut.shorts // cut.block * cut.inner_items,), (cut.inner_items,)
+        outer_scratch = [self._scratch(n) for n in cut.outer_scratch]
+        inner_scratch = [self._scratch(n) for n in cut.inner_scratch]
+        self._first = program.launch(
+            f"restore_{names[0]}_forward", outer_size, outer_group,
+            None, self._spectrum, places, outer_turns, outer_blend, *outer_scratch,
         )  # fmt: skip
-        self._columns = program.launch(
-            "restore_columns", columns, column_items,
-            self._spectrum, self._spectrum, None, column_turns, column_blend, *column_scratch,
+        self._middle = program.launch(
+            f"restore_{names[1]}", inner_size, inner_group,
+            self._spectrum, self._spectrum, None, None, None, inner_turns, inner_blend, *inner_scratch,
+            zero, zero,
         )  # fmt: skip
-        self._rows_inverse = program.launch(
-            "restore_rows_inverse", rows, row_items,
-            self._spectrum, None, places, row_turns, *row_scratch,
+        self._noise_argument = 7 + len(inner_scratch)
+        self._last = program.launch(
+            f"restore_{names[0]}_inverse", outer_size, outer_group,
+            self._spectrum, None, places, outer_turns, *outer_scratch,
         )  # fmt: skip
 
         wiener = Program(
             device,
             "wiener.cl",
-            {"REAL_IS_DOUBLE": self._real == np.float64, "WIENER_BLOCK": cut.block, "WIENER_RUN": cut.run},
+            {
+                "REAL_IS_DOUBLE": self._real == np.float64,
+                "WIENER_BLOCK": cut.block,
+                "WIENER_HALF_ROWS": cut.half_rows,
+            },
         )
-        size = (cut.blocks * cut.block // cut.run, 4 if cut.run > 1 else ny)
-        i32, scale, zero = np.int32, self._real.type(0.5 / (nx * ny)), self._real.type(0)
+        # What the transforms leave undone: 1/2 of two that share one, and 1/n of each axis.
+        self._scale = (1.0 if self.spectrum_dtype == np.float16 else 0.5 / outer.length) / inner.length
+        self._filter_shape = (cut.shorts // cut.block, inner.length, 2, cut.block)
+        self._shorts, self._longs = cut.shorts, inner.length
+        self._filters: dict[int, _Filter] = {}
+        size = (cut.shorts, inner.length)
+        tables, sides = (device.upload(inner.order()), device.upload(frequency)), (i32(ny), i32(nx))
         self._form = wiener.launch(
-            "wiener_axes", size, None, None, None, None, self._order, None,
-            i32(ny), i32(nx), i32(0), i32(0), zero, scale,
+            "wiener_axes", size, None,
+            None, None, None, *tables, None, *sides, i32(0), i32(0), zero, self._real.type(self._scale),
+        )  # fmt: skip
+        self._pair = wiener.launch(
+            "wiener_pair", (max(size),), None,
+            None, None, *tables, None, None, *sides, i32(0), i32(0), i32(inner.length), i32(cut.shorts),
         )  # fmt: skip
         self._arrange = wiener.launch(
-            "wiener_arrange", size, None, None, self._order, None, i32(ny), i32(nx), scale
+            "wiener_arrange", size, None, None, *tables, None, *sides, self._real.type(self._scale)
         )
-        self._h_rows = device.empty((ny,), self._complex)
-        self._h_cols = device.empty((nx,), self._complex)
+        self._axes = device.empty((ny + nx,), self._complex)
         self._noise: DeviceArray | None = None
         self._gain: DeviceArray | None = None
         self._filtered: DeviceArray | None = None
@@ -263,8 +326,7 @@ class Restore:
             Wrong length, not finite, negative; the slot keeps what it had.
         """
         ny, nx = self.padded_shape
-        rows = _checked_axis("h_rows", h_rows, ny).astype(self._complex)
-        cols = _checked_axis("h_cols", h_cols, nx).astype(self._complex)
+        axes = [_checked_axis("h_rows", h_rows, ny), _checked_axis("h_cols", h_cols, nx)]
         noise = checked_nsr(nsr, (ny, nx // 2 + 1))
         slot = _checked_slot(slot)
         level: float | DeviceArray
@@ -274,28 +336,23 @@ class Restore:
             if self._noise is None:
                 self._noise = self.device.empty(noise.shape, self._real)
             level = self._noise.upload(noise.astype(self._real))
-        self.set_filter_axes_device(self._h_rows.upload(rows), self._h_cols.upload(cols), level, slot)
+        self.set_filter_table(self._axes.upload(np.concatenate(axes).astype(self._complex)), level, slot)
 
-    def set_filter_axes_device(
-        self,
-        h_rows: DeviceArray,
-        h_cols: DeviceArray,
-        nsr: float | DeviceArray,
-        slot: int = 0,
-        *,
-        row_entry: int = 0,
-        col_entry: int = 0,
+    def set_filter_table(
+        self, table: DeviceArray, nsr: float | DeviceArray, slot: int = 0, *, entry: int = 0
     ) -> None:
-        """Set a separable filter from 1-D OTFs that are on the device already; enqueues one kernel.
+        """Set a separable filter from 1-D OTFs that are on the device already; enqueues one small kernel.
+
+        With one level of noise no filter is ever stored: the columns' kernel forms it in registers.
 
         Parameters
         ----------
-        h_rows, h_cols
-            (ny,) or (k, ny), and (nx,) or (k, nx), complex of this plan's precision; their values are not
-            checked.
+        table
+            (ny + nx,) or (k, ny + nx), complex of this plan's precision: h_rows, then h_cols, as
+            `OtfTable.out` holds them; its values are not checked.
         nsr
             A number, or (ny, nx // 2 + 1) real on the device.
-        row_entry, col_entry
+        entry
             Which row of a (k, n) table to take.
 
         Raises
@@ -305,34 +362,35 @@ class Restore:
         """
         ny, nx = self.padded_shape
         slot = _checked_slot(slot)
-        for name, table, length, entry in (
-            ("h_rows", h_rows, ny, row_entry),
-            ("h_cols", h_cols, nx, col_entry),
-        ):
-            if table.dtype != self._complex or table.shape[-1] != length or len(table.shape) > 2:
-                raise InputError(
-                    f"{name} is {table.shape} {table.dtype}, ({length},) or (k, {length}) {self._complex} "
-                    "was wanted: sample the OTF at the padded size"
-                )
-            entries = table.size // length
-            if not 0 <= entry < entries:
-                raise InputError(f"entry {entry} of {name} was asked for: it has {entries}, counted from 0")
+        if table.dtype != self._complex or table.shape[-1] != ny + nx or len(table.shape) > 2:
+            raise InputError(
+                f"the table is {table.shape} {table.dtype}, ({ny + nx},) or (k, {ny + nx}) {self._complex} "
+                "was wanted: sample the OTF of rows, then of columns, at the padded size"
+            )
+        entries = table.size // (ny + nx)
+        if not 0 <= entry < entries:
+            raise InputError(f"entry {entry} of the table was asked for: it has {entries}, counted from 0")
+        rows_from, cols_from = np.int32(entry * (ny + nx)), np.int32(entry * (ny + nx) + ny)
         if isinstance(nsr, DeviceArray):
             if nsr.shape != (ny, nx // 2 + 1) or nsr.dtype != self._real:
                 raise InputError(
                     f"nsr is {nsr.shape} {nsr.dtype}, {(ny, nx // 2 + 1)} {self._real} was wanted: give one "
                     "value for each frequency of the padded half spectrum"
                 )
-            self._form.set(2, nsr)
-        else:
-            self._form.set(2, None)
-            self._form.set(9, self._real.type(checked_nsr(float(nsr), (ny, nx // 2 + 1))))
-        self._form.set(0, h_rows)
-        self._form.set(1, h_cols)
-        self._form.set(4, self._slot(slot))
-        self._form.set(7, np.int32(row_entry))
-        self._form.set(8, np.int32(col_entry))
-        self._form()
+            stored = self._stored_filter(slot)
+            self._form.update({0: table, 1: table, 2: nsr, 5: stored, 8: rows_from, 9: cols_from})
+            self._form()
+            return
+        level = float(checked_nsr(float(nsr), (ny, nx // 2 + 1)))
+        kept = self._filters.setdefault(slot, _Filter())
+        if kept.long_axis is None or kept.short_axis is None:
+            kept.long_axis = self.device.empty((self._longs, 2), self._real)
+            kept.short_axis = self.device.empty((self._shorts, 2), self._real)
+        kept.formed, kept.nsr = True, level
+        self._pair.update(
+            {0: table, 1: table, 4: kept.long_axis, 5: kept.short_axis, 8: rows_from, 9: cols_from}
+        )
+        self._pair()
 
     def set_filter(self, gain: ArrayLike | DeviceArray, slot: int = 0) -> None:
         """Set any restoration filter: what each frequency of the padded frame is multiplied by.
@@ -371,7 +429,7 @@ class Restore:
                 self._gain = self.device.empty(wanted, self._complex)
             source = self._gain.upload(values.astype(self._complex))
         self._arrange.set(0, source)
-        self._arrange.set(2, self._slot(slot))
+        self._arrange.set(3, self._stored_filter(slot))
         self._arrange()
 
     # ---- frames -------------------------------------------------------------------------------------------
@@ -404,8 +462,8 @@ class Restore:
             Another shape or type.
         """
         self._require_array("frame", frame, self.in_dtype)
-        self._rows_forward.set(0, frame)
-        self._rows_forward()
+        self._first.set(0, frame)
+        self._first()
         self._transformed = True
 
     def apply(self, out: DeviceArray, slot: int = 0) -> DeviceArray:
@@ -447,12 +505,19 @@ class Restore:
     # ---- inside -------------------------------------------------------------------------------------------
 
     def _finish(self, filtered: DeviceArray, out: DeviceArray, slot: int) -> DeviceArray:
-        self._columns.set(1, filtered)
-        self._columns.set(2, self._filters[slot])
-        self._rows_inverse.set(0, filtered)
-        self._rows_inverse.set(1, out)
-        self._columns()
-        self._rows_inverse()
+        kept = self._filters[slot]
+        self._middle.set(1, filtered)
+        if kept.formed:
+            lift = 2.0 ** (300 if self._real == np.float64 else 40)
+            noise, scale = self._real.type(lift * lift * kept.nsr), self._real.type(lift * self._scale)
+            self._middle.update({2: None, 3: kept.long_axis, 4: kept.short_axis})
+            self._middle.update({self._noise_argument: noise, self._noise_argument + 1: scale})
+        else:
+            self._middle.set(2, kept.stored)
+        self._middle()
+        self._last.set(0, filtered)
+        self._last.set(1, out)
+        self._last()
         return out
 
     def _require_array(self, name: str, array: DeviceArray, dtype: np.dtype[Any]) -> None:
@@ -473,10 +538,12 @@ class Restore:
     def _scratch(self, reals: int) -> DeviceArray | None:
         return self.device.empty((reals,), self._real) if reals else None
 
-    def _slot(self, slot: int) -> DeviceArray:
-        if slot not in self._filters:
-            self._filters[slot] = self.device.empty(self._filter_shape, self._real)
-        return self._filters[slot]
+    def _stored_filter(self, slot: int) -> DeviceArray:
+        kept = self._filters.setdefault(slot, _Filter())
+        if kept.stored is None:
+            kept.stored = self.device.empty(self._filter_shape, self._real)
+        kept.formed = False
+        return kept.stored
 
 
 def _io_defines(in_dtype: np.dtype[Any], out_dtype: np.dtype[Any]) -> dict[str, int | str]:

@@ -289,18 +289,84 @@ def check_wiener(device: Device, size: Size, precision: str) -> Iterator[Outcome
                 8 * _eps(precision),  # a complex product, a squared modulus, a quotient, a product
             )
 
-    order = rng.permutation(ny).astype(np.int32)
+    for half_rows in (0, 1):
+        yield from _laid_out(device, otf, (rows.copy(), columns.copy()), half_rows, precision)
+
+
+def _laid_out(
+    device: Device,
+    gain: NDArray[np.complexfloating[Any, Any]],
+    axes: tuple[NDArray[Any], NDArray[Any]],
+    half_rows: int,
+    precision: str,
+) -> Iterator[Outcome]:
+    """What the restoration reads: blocks of the axis of which half is held, the other whole, both mixed."""
+    (ny, nx), block, scale = (axes[0].size, axes[1].size), 4, 0.375
+    rng = np.random.default_rng(6)
+    short, long = (ny, nx) if half_rows else (nx, ny)
+    held = short // 2 + 1
+    shorts = -(-held // block) * block
+    frequency = np.full(shorts, -1, np.int32)
+    frequency[:held] = rng.permutation(held)
+    order = rng.permutation(long).astype(np.int32)
     real = device.real_type(precision)
-    out = device.empty(half, kind)
-    program = Program(device, "wiener.cl", {"REAL_IS_DOUBLE": precision == "float64"})
+    defines = {
+        "REAL_IS_DOUBLE": precision == "float64",
+        "WIENER_BLOCK": block,
+        "WIENER_HALF_ROWS": half_rows,
+    }
+    program = Program(device, "wiener.cl", defines)
+    tables = (device.upload(order), device.upload(frequency))
+    sides = (np.int32(ny), np.int32(nx))
+    where = f"half of the {'rows' if half_rows else 'columns'}, {_at((ny, nx), precision)}"
+
+    def outcome(kernel: str, found: NDArray[Any], wanted: NDArray[Any], bound: float) -> Outcome:
+        blocks = np.zeros((shorts, found.shape[1]), complex)
+        blocks[:held] = wanted
+        there = found[..., 0, :] + 1j * found[..., 1, :]
+        apart = np.abs(there.transpose(0, 2, 1).reshape(blocks.shape) - blocks)
+        return Outcome(
+            f"{kernel}, {where}", (kernel,), "|dG|", float(apart.max() / np.abs(blocks).max()), bound
+        )
+
+    out = device.empty((shorts // block, long, 2, block), real)
     program.launch(
-        "wiener_arrange", (half[1], ny), None,
-        device.upload(otf), device.upload(order), out, np.int32(ny), np.int32(nx), real.type(0.375),
+        "wiener_arrange", (shorts, long), None,
+        device.upload(gain), *tables, out, *sides, real.type(scale),
     )()  # fmt: skip
-    arranged = 0.375 * otf[order]
-    relative = np.abs(out.download() - arranged) / np.where(arranged == 0, 1, np.abs(arranged))
-    name = f"wiener_arrange, {_at(size, precision)}"
-    yield Outcome(name, ("wiener_arrange",), "|dG|/|G|", float(relative.max()), _eps(precision))
+    # What the inverse real transform makes of any gain at all.
+    whole = np.fft.fft2(np.fft.irfft2(gain.astype(np.complex128), s=(ny, nx)))
+    half = whole if half_rows else gain.astype(np.complex128).T
+    wanted = scale * half[frequency[:held]][:, order]
+    # The mean of two, and a product; and what two transforms there and back lose on the page.
+    bound = 2 * _eps(precision) + 10 * _eps("float64")
+    yield outcome("wiener_arrange", out.download(), wanted, bound)
+
+    h_rows, h_cols = axes
+    table = device.upload(np.concatenate([h_rows, h_cols]))
+    long_axis = device.empty((long, 2), real)
+    short_axis = device.empty((shorts // block, 2, block), real)
+    program.launch(
+        "wiener_pair", (max(long, shorts),), None,
+        table, table, *tables, long_axis, short_axis, *sides, np.int32(0), np.int32(ny), np.int32(long),
+        np.int32(shorts),
+    )()  # fmt: skip
+    lift = 2.0 ** (150 if precision == "float64" else 20)
+    for axis in axes:
+        if axis.size % 2 == 0:
+            axis[axis.size // 2] = axis[axis.size // 2].real
+    h_short, h_long = axes if half_rows else axes[::-1]
+    yield outcome(
+        "wiener_pair",
+        short_axis.download()[:, None] / lift,
+        h_short[frequency[:held]][:, None],
+        _eps(precision),
+    )
+    found = long_axis.download() / lift
+    apart = np.abs(found[:, 0] + 1j * found[:, 1] - h_long[order])
+    yield Outcome(
+        f"wiener_pair along, {where}", ("wiener_pair",), "|dH|", float(apart.max()), _eps(precision)
+    )
 
 
 def check_restore(device: Device, size: Size, precision: str) -> Iterator[Outcome]:
@@ -317,6 +383,14 @@ def check_restore(device: Device, size: Size, precision: str) -> Iterator[Outcom
                 opened, size, family=family, precision=precision, in_dtype=kind, out_dtype=kind, padding=3
             )
             yield _restored(plan, f"restore {form} of {kind}, {_at(size, precision)}", precision)
+        if precision == "float32":
+            for kind in ("uint8", "uint16") if opened is device else ():
+                plan = Restore(
+                    opened, size, family=family, in_dtype=kind, out_dtype=kind, spectrum_dtype=np.float16
+                )
+                yield _restored(
+                    plan, f"restore {form} of {kind} in halves, {_at(size, precision)}", precision
+                )
 
 
 def _restored(plan: Restore, name: str, precision: str) -> Outcome:
@@ -331,22 +405,32 @@ def _restored(plan: Restore, name: str, precision: str) -> Outcome:
     turn = np.exp(-_TURN * 1j * (np.fft.fftfreq(ny)[:, None] + 2 * np.fft.rfftfreq(nx)[None, :]))
     gain = (0.75 * turn).astype(np.result_type(precision, np.complex64))
     plan.set_filter(gain, slot=1)
+    noise = 2.0 ** np.random.default_rng(7).integers(-6, 1, gain.shape)
+    plan.set_filter_axes(rows, columns, noise, slot=2)
     error, bound = 0.0, 0.0
     limit = 5e-7 if precision == "float32" else 1e-14
-    for slot, wanted_gain in ((0, reference.wiener_of_axes(rows, columns, 2.0**-6)), (1, gain)):
+    halves = plan.spectrum_dtype == np.float16
+    filters = (
+        reference.wiener_of_axes(rows, columns, 2.0**-6),
+        gain,
+        reference.wiener_of_axes(rows, columns, noise),
+    )
+    for slot, wanted_gain in enumerate(filters):
         wanted = reference.restore(frame, wanted_gain, plan.padded_shape)
         found = plan.restore(frame, slot).astype(np.float64)
         if kind.kind == "u":
             # A code may be off by half a step, and by the whole L2 error in one pixel.
             error = max(error, _largest(found - np.clip(wanted, 0, top)))
-            bound = max(bound, 0.5 + limit * float(np.linalg.norm(wanted)))
+            bound = max(bound, 3 * top / 255 if halves else 0.5 + limit * float(np.linalg.norm(wanted)))
         else:
             error, bound = max(error, _relative(found, wanted)), limit
             if kind.name != precision:  # stored in float32 after float64 arithmetic
                 bound = _eps("float32") / 2
+    outer, inner = ("columns", "rows") if plan.family == "lanes" else ("rows", "columns")
+    kernels = (f"restore_{outer}_forward", f"restore_{inner}", f"restore_{outer}_inverse")
     return Outcome(
         name,
-        ("restore_rows_forward", "restore_columns", "restore_rows_inverse", "wiener_axes", "wiener_arrange"),
+        (*kernels, "wiener_axes", "wiener_pair", "wiener_arrange"),
         "levels" if kind.kind == "u" else "relative L2",
         error,
         bound,

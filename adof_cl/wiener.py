@@ -55,15 +55,14 @@ class WienerFilter:
         self._h_cols = device.empty((nx,), self._complex)
         self._otf = device.empty(half, self._complex)
         self._noise = device.empty(half, self._real)
-        order = device.upload(np.arange(ny, dtype=np.int32))
         i32, one, zero = np.int32, self._real.type(1), self._real.type(0)
         self._axes = program.launch(
             "wiener_axes", (half[1], ny), None,
-            self._h_rows, self._h_cols, None, order, None, i32(ny), i32(nx), i32(0), i32(0), zero, one,
+            self._h_rows, self._h_cols, None, None, None, None, i32(ny), i32(nx), i32(0), i32(0), zero, one,
         )  # fmt: skip
         self._spectrum = program.launch(
             "wiener_spectrum", (half[1], ny), None,
-            self._otf, None, order, None, i32(ny), i32(nx), zero, one,
+            self._otf, None, None, None, None, i32(ny), i32(nx), zero, one,
         )  # fmt: skip
 
     def from_otf_axes(
@@ -98,8 +97,8 @@ class WienerFilter:
         self._h_rows.upload(axes[0])
         self._h_cols.upload(axes[1])
         self._axes.set(2, noise)
-        self._axes.set(4, out)
-        self._axes.set(9, level)
+        self._axes.set(5, out)
+        self._axes.set(10, level)
         self._axes()
         return out
 
@@ -120,8 +119,8 @@ class WienerFilter:
         out = self._checked_out(out)
         self._otf.upload(spectrum.astype(self._complex))
         self._spectrum.set(1, noise)
-        self._spectrum.set(3, out)
-        self._spectrum.set(6, level)
+        self._spectrum.set(4, out)
+        self._spectrum.set(7, level)
         self._spectrum()
         return out
 

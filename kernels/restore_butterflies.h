@@ -11,9 +11,9 @@
 #ifndef ADOF_RESTORE_BUTTERFLIES_H
 #define ADOF_RESTORE_BUTTERFLIES_H
 
-#include "restore_vectors.h"
+#include "lanes.h"
 
-RESTORE_INLINE void restore_radix2(vec *xr, vec *xi)
+ALWAYS_INLINE void restore_radix2(vec *xr, vec *xi)
 {
     const vec r = xr[0] - xr[1], i = xi[0] - xi[1];
     xr[0] += xr[1];
@@ -22,7 +22,7 @@ RESTORE_INLINE void restore_radix2(vec *xr, vec *xi)
     xi[1] = i;
 }
 
-RESTORE_INLINE void restore_radix3(vec *xr, vec *xi)
+ALWAYS_INLINE void restore_radix3(vec *xr, vec *xi)
 {
     const real half_width = REAL_C(0.86602540378443864676);   // sin(2 pi / 3)
     const vec sr = xr[1] + xr[2], si = xi[1] + xi[2];
@@ -36,7 +36,7 @@ RESTORE_INLINE void restore_radix3(vec *xr, vec *xi)
     xi[2] = mi + dr;
 }
 
-RESTORE_INLINE void restore_radix4(vec *xr, vec *xi)
+ALWAYS_INLINE void restore_radix4(vec *xr, vec *xi)
 {
     const vec ar = xr[0] + xr[2], ai = xi[0] + xi[2], br = xr[0] - xr[2], bi = xi[0] - xi[2];
     const vec cr = xr[1] + xr[3], ci = xi[1] + xi[3], dr = xr[1] - xr[3], di = xi[1] - xi[3];
@@ -50,7 +50,7 @@ RESTORE_INLINE void restore_radix4(vec *xr, vec *xi)
     xi[3] = bi + dr;
 }
 
-RESTORE_INLINE void restore_radix5(vec *xr, vec *xi)
+ALWAYS_INLINE void restore_radix5(vec *xr, vec *xi)
 {
     const real c1 = REAL_C(0.30901699437494742410), c2 = REAL_C(-0.80901699437494742410);
     const real s1 = REAL_C(0.95105651629515357212), s2 = REAL_C(0.58778525229247312917);
@@ -72,7 +72,7 @@ RESTORE_INLINE void restore_radix5(vec *xr, vec *xi)
     xi[4] = m1i + n1r;
 }
 
-RESTORE_INLINE void restore_radix7(vec *xr, vec *xi)
+ALWAYS_INLINE void restore_radix7(vec *xr, vec *xi)
 {
     const real c1 = REAL_C(0.62348980185873353053), c2 = REAL_C(-0.22252093395631440429);
     const real c3 = REAL_C(-0.90096886790241912624), s1 = REAL_C(0.78183148246802980871);
@@ -102,7 +102,7 @@ RESTORE_INLINE void restore_radix7(vec *xr, vec *xi)
     xi[6] = m1i + n1r;
 }
 
-RESTORE_INLINE void restore_radix8(vec *xr, vec *xi)
+ALWAYS_INLINE void restore_radix8(vec *xr, vec *xi)
 {
     const real h = REAL_C(0.70710678118654752440);
     vec er[4] = {xr[0], xr[2], xr[4], xr[6]}, ei[4] = {xi[0], xi[2], xi[4], xi[6]};
@@ -137,7 +137,7 @@ RESTORE_INLINE void restore_radix8(vec *xr, vec *xi)
         xr[K] = turned;                                       \
     }
 
-RESTORE_INLINE void restore_radix9(vec *xr, vec *xi)
+ALWAYS_INLINE void restore_radix9(vec *xr, vec *xi)
 {
     vec ar[3] = {xr[0], xr[3], xr[6]}, ai[3] = {xi[0], xi[3], xi[6]};
     vec br[3] = {xr[1], xr[4], xr[7]}, bi[3] = {xi[1], xi[4], xi[7]};
@@ -176,7 +176,7 @@ RESTORE_INLINE void restore_radix9(vec *xr, vec *xi)
 // Coprime P, Q: input n = (Q a + P b) mod PQ, output k = (U a + V b) mod PQ with U = 1 mod P, 0 mod Q and
 // V = 0 mod P, 1 mod Q.
 #define RESTORE_COPRIME(N, P, Q, U, V)                              \
-    RESTORE_INLINE void restore_radix##N(vec *xr, vec *xi)          \
+    ALWAYS_INLINE void restore_radix##N(vec *xr, vec *xi)          \
     {                                                               \
         vec tr[N], ti[N];                                           \
         _Pragma("unroll")                                           \

@@ -1,133 +1,250 @@
 // restore_lanes.cl : undo a known blur of a frame, for processors with wide SIMD and few cores.
 //
 //   restored = IFFT2( FFT2( padded frame ) * filter )    docs/maths.md, eqs. W2 to W5
+//   filter   = conj(H) / (|H|^2 + nsr), H = h_row h_column, where it is not stored            eqs. W1 and W9
 //
-// Three kernels, no barriers: rows forward; columns forward, times filter, columns inverse; rows inverse. A
-// work-item owns LANES * 2 rows or LANES columns, one to each SIMD lane. The transforms run in place,
-// decimated in frequency going forward and in time coming back, so that nothing is ever reordered: rows and
-// filter are addressed in digit-reversed order instead.
+// Three kernels, no barriers: columns forward; rows forward, times filter, rows inverse; columns inverse. A
+// work-item owns LANES * 2 columns or the spectra of LANES rows, one to each SIMD lane: pixels are read and written
+// as they lie, and only the spectra change their lanes, once there and once back. The transforms run decimated in
+// frequency going forward and in time coming back, so that nothing is ever reordered: spectrum and filter are
+// addressed in digit-reversed order instead. What lies between the first pass forward and the last one back runs
+// to its end on one part of the first pass before the next part is touched, in the cache nearest to the core.
 //
 //   frame     (ROWS, COLS) IN_TYPE              the image to restore
 //   image     (ROWS, COLS) OUT_TYPE             the restored image; integers are rounded and clamped
-//   spectrum  (BLOCKS, HELD, 2, LANES) real     block of columns, row, real or imaginary, column in the block
+//   spectrum  (STRIPS, SLOTS, 2, 2, LANES) stored   strip of columns; vertical frequency; half of the strip; real or
+//                                               imaginary; column. half where HALF_SPECTRUM, else real
 //   filtered  like spectrum                     may be the spectrum itself
-//   filter    (BLOCKS, NY, 2, LANES) real       the same, rows digit-reversed, scaled by 1 / (2 NX NY)
-//   position  (2, BLOCKS * LANES) int           where frequency k, and then NX - k, lies after the passes
+//   filter    (SLOTS / LANES, NX, 2, LANES) real   block of vertical frequencies; horizontal ones, digit-reversed;
+//                                               times the scale below. Or null:
+//   long_axis (NX, 2) real, short_axis (SLOTS / LANES, 2, LANES) real   H along x and y as wiener_pair lays it out
+//   position  (2, SLOTS) int                    where a slot's frequency k, and NY - k, lie after the passes
 //   row_blend (NX - COLS) real, column_blend (NY - ROWS) real   share of the near edge in the padding
 //   row_turns, column_turns   real              twiddle factors, pass by pass: cos and -sin, q = 1 .. R - 1
+//   noise, scale              real              nsr and what the transforms leave undone, as wiener_pair wants
 //
 // A work-item's samples lie real, imaginary, real, .. : apart, the strides of a power of two would fill the
 // same cache sets twice over.
 //
-// Defines: ROWS, COLS frame; NX, NY padded; HELD rows kept in the spectrum; BLOCKS column blocks; IN_TYPE,
-// OUT_TYPE; OUT_LIMIT the largest code of an integer output, 0 for a real one. The passes come from the
-// generated lists ROW_PASSES, ROW_PASSES_BACK, COLUMN_PASSES, COLUMN_PASSES_BACK, COLUMN_LAST.
+// Defines: VECTOR_BYTES; ROWS, COLS frame; NX, NY padded; STRIPS of columns; HELD frequencies of a column of the
+// frame, SLOTS that number in whole blocks of LANES; IN_TYPE, OUT_TYPE; OUT_LIMIT the largest code of an integer
+// output, 0 for a real one; STREAM_IMAGE: the caches cannot hold it and its strips are whole lines; HALF_SPECTRUM; STORED_LEVEL grey levels to a stored one, 1 but for half. The passes come
+// from the generated lists: ROW_FIRST, then ROW_MIDDLE and ROW_LAST in each part of ROW_INNER samples; likewise columns.
 //
-// Local size 1; no local memory. Private memory: two vectors of 64 bytes for each sample of a row or column.
+// Local size 1; no local memory. Private memory: two vectors for each sample of a row or column.
 // Error: below 4e-7 (float) and 1e-15 (double), relative L2, 8 x 8 to 1024 x 1024, PoCL and Intel's runtime.
-
-#define RESTORE_LANES 1
 
 #include "restore_transpose.h"
 #include "restore_butterflies.h"
 
-#define RESTORE_JOIN_(A, B) A##B
-#define RESTORE_JOIN(A, B)  RESTORE_JOIN_(A, B)
+#define STRIP (2 * LANES)
 
 // Rows of a frame start anywhere: these promise no more than their element's alignment.
-typedef RESTORE_JOIN(IN_TYPE, LANES)  in_vec  __attribute__((aligned(IN_BYTES)));
-typedef RESTORE_JOIN(OUT_TYPE, LANES) out_vec __attribute__((aligned(OUT_BYTES)));
+typedef JOIN(IN_TYPE, LANES)  in_vec  __attribute__((aligned(IN_BYTES)));
+typedef JOIN(OUT_TYPE, LANES) out_vec __attribute__((aligned(OUT_BYTES)));
 
-// OpenCL's convert_ functions are calls on some compilers, a vector conversion is one instruction.
-#if defined(__has_builtin) && !RESTORE_PORTABLE
-#if __has_builtin(__builtin_convertvector)
-#define RESTORE_CONVERT(V, TYPE) __builtin_convertvector(V, RESTORE_JOIN(TYPE, LANES))
-#endif
-#endif
-#ifndef RESTORE_CONVERT
-#define RESTORE_CONVERT(V, TYPE) RESTORE_JOIN(RESTORE_JOIN(convert_, TYPE), LANES)(V)
-#endif
-
-// Without this, LLVM halves 64-byte vectors even where the registers hold them.
-#ifdef __has_attribute
-#if __has_attribute(min_vector_width)
-#define RESTORE_WIDE __attribute__((min_vector_width(512)))
-#endif
-#endif
-#ifndef RESTORE_WIDE
-#define RESTORE_WIDE
+#if HALF_SPECTRUM && __has_builtin(__builtin_convertvector) && !PORTABLE
+typedef half stored __attribute__((ext_vector_type(LANES)));
+#define GET(P, I)    __builtin_convertvector((P)[I], vec)
+#define PUT(P, I, V) (P)[I] = __builtin_convertvector(V, stored)
+#elif HALF_SPECTRUM
+typedef struct { ushort bits[LANES]; } stored;
+#define GET(P, I)    JOIN(vload_half, LANES)(I, (__global const half *)(P))
+#define PUT(P, I, V) JOIN(vstore_half, LANES)(V, I, (__global half *)(P))
+#else
+typedef vec stored;
+#define GET(P, I)    (P)[I]
+#define PUT(P, I, V) (P)[I] = V
 #endif
 
-// One pass forward over LENGTH values in runs of R * M: butterfly, then turn by exp(-2 pi i j q / (R M)).
-// And one pass back: turn the other way, then the inverse butterfly.
+// Half holds up to 65504: a stored spectrum is scaled to the range of the pixels, and by STORED_LEVEL into half's.
+#if HALF_SPECTRUM
+#define SCALED(V) ((V) * (vec)(REAL_C(0.5) / (NY * STORED_LEVEL)))
+#else
+#define SCALED(V) (V)
+#endif
+
+// The next strips of a row lie far apart, where no processor looks ahead.
+#if __has_builtin(__builtin_prefetch)
+#define PREFETCH(P) __builtin_prefetch(P)
+#else
+#define PREFETCH(P)
+#endif
+
+// Stores past the caches, to lines that are written whole.
+#if __has_builtin(__builtin_nontemporal_store)
+#define STREAM(P, V) __builtin_nontemporal_store(V, (__global JOIN(OUT_TYPE, LANES) *)(P))
+#else
+#define STREAM(P, V) *(__global JOIN(OUT_TYPE, LANES) *)(P) = V
+#endif
+
+// ---- pixels -----------------------------------------------------------------------------------------------
+
+ALWAYS_INLINE vec restore_pixels(__global const IN_TYPE *frame, const int row, const int col)
+{
+    return CONVERT(*(__global const in_vec *)(frame + (size_t)row * COLS + col), SCALAR);
+}
+
+ALWAYS_INLINE vec restore_level(const vec v)
+{
+    vec level = v * (vec)(STORED_LEVEL);
+#if OUT_LIMIT
+    level = level > (vec)(0) ? level : (vec)(0);
+    level = (level < (vec)(OUT_LIMIT) ? level : (vec)(OUT_LIMIT)) + REAL_C(0.5);    // the conversion truncates
+#endif
+    return level;
+}
+
+ALWAYS_INLINE void restore_store(__global OUT_TYPE *image, const int row, const int col, const vec v)
+{
+    __global OUT_TYPE *to = image + (size_t)row * COLS + col;
+    if (STREAM_IMAGE)
+        STREAM(to, CONVERT(restore_level(v), OUT_TYPE));
+    else
+        *(__global out_vec *)to = CONVERT(restore_level(v), OUT_TYPE);
+}
+
+#if COLS % STRIP
+// The last strip, of fewer columns, pixel by pixel; 0 beyond the frame.
+ALWAYS_INLINE void restore_gather(vec *work, __global const IN_TYPE *frame, const int col,
+                                  __global const real *column_blend)
+{
+    for (int y = 0; y < ROWS; ++y) {
+        vec v[2] = {(vec)(0), (vec)(0)};
+        for (int i = 0; i < COLS - col; ++i) ((real *)v)[i] = (real)frame[(size_t)y * COLS + col + i];
+        work[2 * y] = v[0];
+        work[2 * y + 1] = v[1];
+    }
+    for (int y = 2 * ROWS; y < 2 * NY; ++y) {
+        const vec far = work[2 * ROWS - 2 + y % 2];
+        work[y] = far + column_blend[y / 2 - ROWS] * (work[y % 2] - far);
+    }
+}
+
+ALWAYS_INLINE void restore_scatter(const vec *work, __global OUT_TYPE *image, const int col)
+{
+    for (int y = 0; y < ROWS; ++y) {
+        const vec v[2] = {restore_level(work[2 * y]), restore_level(work[2 * y + 1])};
+        for (int i = 0; i < COLS - col; ++i) image[(size_t)y * COLS + col + i] = (OUT_TYPE)((const real *)v)[i];
+    }
+}
+#endif
+
+// ---- passes -----------------------------------------------------------------------------------------------
+
+// Forward, a butterfly is followed by turns of exp(-2 pi i j q / (R M)); back, it follows the opposite turns.
 #define RESTORE_DEFINE_PASSES(R)                                                                            \
-    RESTORE_INLINE void restore_forward##R(vec *re, vec *im, const int length, const int m,                 \
-                                           __global const real *turns)                                      \
+    ALWAYS_INLINE void restore_turn##R(vec *xr, vec *xi, __global const real *turns)                        \
+    {                                                                                                       \
+        _Pragma("unroll")                                                                                   \
+        for (int q = 1; q < R; ++q) {                                                                       \
+            const real c = turns[2 * q - 2], s = turns[2 * q - 1];                                          \
+            const vec r = xr[q];                                                                            \
+            xr[q] = r * c - xi[q] * s;                                                                      \
+            xi[q] = r * s + xi[q] * c;                                                                      \
+        }                                                                                                   \
+    }                                                                                                       \
+    ALWAYS_INLINE void restore_turn_back##R(vec *xr, vec *xi, __global const real *turns)                   \
+    {                                                                                                       \
+        _Pragma("unroll")                                                                                   \
+        for (int q = 1; q < R; ++q) {                                                                       \
+            const real c = turns[2 * q - 2], s = turns[2 * q - 1];                                          \
+            const vec r = xr[q];                                                                            \
+            xr[q] = r * c + xi[q] * s;                                                                      \
+            xi[q] = xi[q] * c - r * s;                                                                      \
+        }                                                                                                   \
+    }                                                                                                       \
+    ALWAYS_INLINE void restore_get##R(const vec *work, const int m, vec *xr, vec *xi)                       \
+    {                                                                                                       \
+        _Pragma("unroll")                                                                                   \
+        for (int q = 0; q < R; ++q) {                                                                       \
+            xr[q] = work[2 * q * m];                                                                        \
+            xi[q] = work[2 * q * m + 1];                                                                    \
+        }                                                                                                   \
+    }                                                                                                       \
+    ALWAYS_INLINE void restore_put##R(vec *work, const int m, const vec *xr, const vec *xi)                 \
+    {                                                                                                       \
+        _Pragma("unroll")                                                                                   \
+        for (int q = 0; q < R; ++q) {                                                                       \
+            work[2 * q * m] = xr[q];                                                                        \
+            work[2 * q * m + 1] = xi[q];                                                                    \
+        }                                                                                                   \
+    }                                                                                                       \
+    ALWAYS_INLINE void restore_forward##R(vec *work, const int length, const int m,                         \
+                                          __global const real *turns)                                       \
     {                                                                                                       \
         for (int b = 0; b < length; b += R * m)                                                             \
             for (int j = 0; j < m; ++j) {                                                                   \
                 vec xr[R], xi[R];                                                                           \
-                _Pragma("unroll")                                                                           \
-                for (int q = 0; q < R; ++q) {                                                               \
-                    xr[q] = re[2 * (b + j + q * m)];                                                        \
-                    xi[q] = im[2 * (b + j + q * m)];                                                        \
-                }                                                                                           \
+                restore_get##R(work + 2 * (b + j), m, xr, xi);                                              \
                 restore_radix##R(xr, xi);                                                                   \
-                re[2 * (b + j)] = xr[0];                                                                    \
-                im[2 * (b + j)] = xi[0];                                                                    \
-                _Pragma("unroll")                                                                           \
-                for (int q = 1; q < R; ++q) {                                                               \
-                    if (m == 1) {                                                                           \
-                        re[2 * (b + j + q * m)] = xr[q];                                                    \
-                        im[2 * (b + j + q * m)] = xi[q];                                                    \
-                    } else {                                                                                \
-                        const real c = turns[2 * (j * (R - 1) + q - 1)];                                    \
-                        const real s = turns[2 * (j * (R - 1) + q - 1) + 1];                                \
-                        re[2 * (b + j + q * m)] = xr[q] * c - xi[q] * s;                                    \
-                        im[2 * (b + j + q * m)] = xr[q] * s + xi[q] * c;                                    \
-                    }                                                                                       \
-                }                                                                                           \
+                if (m > 1) restore_turn##R(xr, xi, turns + 2 * j * (R - 1));                                \
+                restore_put##R(work + 2 * (b + j), m, xr, xi);                                              \
             }                                                                                               \
     }                                                                                                       \
-    RESTORE_INLINE void restore_back##R(vec *re, vec *im, const int length, const int m,                    \
-                                        __global const real *turns)                                         \
+    ALWAYS_INLINE void restore_back##R(vec *work, const int length, const int m,                            \
+                                       __global const real *turns)                                          \
     {                                                                                                       \
         for (int b = 0; b < length; b += R * m)                                                             \
             for (int j = 0; j < m; ++j) {                                                                   \
                 vec xr[R], xi[R];                                                                           \
-                xr[0] = re[2 * (b + j)];                                                                    \
-                xi[0] = im[2 * (b + j)];                                                                    \
-                _Pragma("unroll")                                                                           \
-                for (int q = 1; q < R; ++q) {                                                               \
-                    const vec r = re[2 * (b + j + q * m)], i = im[2 * (b + j + q * m)];                     \
-                    if (m == 1) {                                                                           \
-                        xr[q] = r;                                                                          \
-                        xi[q] = i;                                                                          \
-                    } else {                                                                                \
-                        const real c = turns[2 * (j * (R - 1) + q - 1)];                                    \
-                        const real s = turns[2 * (j * (R - 1) + q - 1) + 1];                                \
-                        xr[q] = r * c + i * s;                                                              \
-                        xi[q] = i * c - r * s;                                                              \
-                    }                                                                                       \
-                }                                                                                           \
+                restore_get##R(work + 2 * (b + j), m, xr, xi);                                              \
+                if (m > 1) restore_turn_back##R(xr, xi, turns + 2 * j * (R - 1));                           \
                 restore_radix##R(xi, xr);                                                                   \
-                _Pragma("unroll")                                                                           \
-                for (int q = 0; q < R; ++q) {                                                               \
-                    re[2 * (b + j + q * m)] = xr[q];                                                        \
-                    im[2 * (b + j + q * m)] = xi[q];                                                        \
-                }                                                                                           \
+                restore_put##R(work + 2 * (b + j), m, xr, xi);                                              \
             }                                                                                               \
     }                                                                                                       \
-    /* The last pass forward, the filter and the first pass back, without leaving the registers. */         \
-    RESTORE_INLINE void restore_filter##R(vec *re, vec *im, const int length, __global const vec *filter)   \
+    /* The first pass down a strip of columns; the rows of the padding are made from the first and last. */ \
+    ALWAYS_INLINE void restore_load##R(vec *work, const int m, __global const real *turns,                  \
+                                       __global const IN_TYPE *frame, const int col,                        \
+                                       __global const real *column_blend)                                   \
     {                                                                                                       \
-        for (int b = 0; b < length; b += R) {                                                               \
+        const vec near_r = restore_pixels(frame, 0, col), near_i = restore_pixels(frame, 0, col + LANES);   \
+        const vec far_r = restore_pixels(frame, ROWS - 1, col);                                             \
+        const vec far_i = restore_pixels(frame, ROWS - 1, col + LANES);                                     \
+        for (int j = 0; j < m; ++j) {                                                                       \
             vec xr[R], xi[R];                                                                               \
             _Pragma("unroll")                                                                               \
             for (int q = 0; q < R; ++q) {                                                                   \
-                xr[q] = re[2 * (b + q)];                                                                    \
-                xi[q] = im[2 * (b + q)];                                                                    \
+                const int y = j + q * m;                                                                    \
+                if ((q + 1) * m <= ROWS || y < ROWS) {                                                      \
+                    xr[q] = restore_pixels(frame, y, col);                                                  \
+                    xi[q] = restore_pixels(frame, y, col + LANES);                                          \
+                } else {                                                                                    \
+                    const real w = column_blend[y - ROWS];                                                  \
+                    xr[q] = far_r + w * (near_r - far_r);                                                   \
+                    xi[q] = far_i + w * (near_i - far_i);                                                   \
+                }                                                                                           \
             }                                                                                               \
+            restore_radix##R(xr, xi);                                                                       \
+            restore_turn##R(xr, xi, turns + 2 * j * (R - 1));                                               \
+            restore_put##R(work + 2 * j, m, xr, xi);                                                        \
+        }                                                                                                   \
+    }                                                                                                       \
+    ALWAYS_INLINE void restore_unload##R(const vec *work, const int m, __global const real *turns,          \
+                                         __global OUT_TYPE *image, const int col)                           \
+    {                                                                                                       \
+        for (int j = 0; j < m; ++j) {                                                                       \
+            vec xr[R], xi[R];                                                                               \
+            restore_get##R(work + 2 * j, m, xr, xi);                                                        \
+            restore_turn_back##R(xr, xi, turns + 2 * j * (R - 1));                                          \
+            restore_radix##R(xi, xr);                                                                       \
+            _Pragma("unroll")                                                                               \
+            for (int q = 0; q < R; ++q) {                                                                   \
+                const int y = j + q * m;                                                                    \
+                if ((q + 1) * m <= ROWS || y < ROWS) {                                                      \
+                    restore_store(image, y, col, xr[q]);                                                    \
+                    restore_store(image, y, col + LANES, xi[q]);                                            \
+                }                                                                                           \
+            }                                                                                               \
+        }                                                                                                   \
+    }                                                                                                       \
+    /* The last pass forward, the filter and the first pass back, without leaving the registers. */         \
+    ALWAYS_INLINE void restore_filter##R(vec *work, const int length, __global const vec *filter)           \
+    {                                                                                                       \
+        for (int b = 0; b < length; b += R) {                                                               \
+            vec xr[R], xi[R];                                                                               \
+            restore_get##R(work + 2 * b, 1, xr, xi);                                                        \
             restore_radix##R(xr, xi);                                                                       \
             _Pragma("unroll")                                                                               \
             for (int q = 0; q < R; ++q) {                                                                   \
@@ -136,11 +253,28 @@ typedef RESTORE_JOIN(OUT_TYPE, LANES) out_vec __attribute__((aligned(OUT_BYTES))
                 xi[q] = r * fi + xi[q] * fr;                                                                \
             }                                                                                               \
             restore_radix##R(xi, xr);                                                                       \
+            restore_put##R(work + 2 * b, 1, xr, xi);                                                        \
+        }                                                                                                   \
+    }                                                                                                       \
+    ALWAYS_INLINE void restore_wiener##R(vec *work, const int length, __global const real *long_axis,       \
+                                         const vec hr, const vec hi, const real noise, const real scale)    \
+    {                                                                                                       \
+        const vec short_power = hr * hr + hi * hi;                                                          \
+        for (int b = 0; b < length; b += R) {                                                               \
+            vec xr[R], xi[R];                                                                               \
+            restore_get##R(work + 2 * b, 1, xr, xi);                                                        \
+            restore_radix##R(xr, xi);                                                                       \
             _Pragma("unroll")                                                                               \
             for (int q = 0; q < R; ++q) {                                                                   \
-                re[2 * (b + q)] = xr[q];                                                                    \
-                im[2 * (b + q)] = xi[q];                                                                    \
+                const real gr = long_axis[2 * (b + q)], gi = long_axis[2 * (b + q) + 1];                    \
+                const vec power = (gr * gr + gi * gi) * short_power + noise;                                \
+                const vec share = power > (vec)(0) ? scale / power : (vec)(0);                              \
+                const vec tr = xr[q] * gr + xi[q] * gi, ti = xi[q] * gr - xr[q] * gi;                       \
+                xr[q] = (tr * hr + ti * hi) * share;                                                        \
+                xi[q] = (ti * hr - tr * hi) * share;                                                        \
             }                                                                                               \
+            restore_radix##R(xi, xr);                                                                       \
+            restore_put##R(work + 2 * b, 1, xr, xi);                                                        \
         }                                                                                                   \
     }
 
@@ -156,183 +290,166 @@ RESTORE_DEFINE_PASSES(10)
 RESTORE_DEFINE_PASSES(12)
 RESTORE_DEFINE_PASSES(15)
 
-#define ROW_FORWARD(R, M, T)    restore_forward##R(re, im, NX, M, row_turns + T);
-#define ROW_BACK(R, M, T)       restore_back##R(re, im, NX, M, row_turns + T);
-#define COLUMN_FORWARD(R, M, T) restore_forward##R(re, im, NY, M, column_turns + T);
-#define COLUMN_BACK(R, M, T)    restore_back##R(re, im, NY, M, column_turns + T);
-#define COLUMN_FILTER(R)        restore_filter##R(re, im, NY, block_filter);
+#define COLUMN_LOAD(R, M, T)    restore_load##R(work, M, column_turns + T, frame, col, column_blend);
+#define COLUMN_FORWARD(R, M, T) restore_forward##R(part, length, M, column_turns + T);
+#define COLUMN_BACK(R, M, T)    restore_back##R(part, length, M, column_turns + T);
+#define COLUMN_UNLOAD(R, M, T)  restore_unload##R(work, M, column_turns + T, image, col);
+#define ROW_FORWARD(R, M, T)    restore_forward##R(part, length, M, row_turns + T);
+#define ROW_BACK(R, M, T)       restore_back##R(part, length, M, row_turns + T);
+#define ROW_FILTER(R, M, T)     restore_filter##R(part, length, block_filter + 2 * b);
+#define ROW_WIENER(R, M, T)     restore_wiener##R(part, length, long_axis + 2 * b, hr, hi, noise, scale);
 
-// LANES columns from `col` on of the rows `row` to `row + LANES - 1`, one row to a lane; 0 below the frame,
-// since whatever stood there would leak its rounding errors into the row it shares a transform with.
-RESTORE_INLINE void restore_load_square(vec *v, __global const IN_TYPE *frame, const int row, const int col)
-{
-    vec square[LANES];
-    _Pragma("unroll")
-    for (int i = 0; i < LANES; ++i)
-        square[i] = row + i < ROWS
-            ? RESTORE_CONVERT(*(__global const in_vec *)(frame + (size_t)(row + i) * COLS + col), SCALAR)
-            : (vec)(0);
-    restore_transpose(square);
-    _Pragma("unroll")
-    for (int i = 0; i < LANES; ++i) v[2 * i] = square[i];
-}
+// ---- kernels ----------------------------------------------------------------------------------------------
 
-RESTORE_INLINE void restore_load(vec *v, __global const IN_TYPE *frame, const int row)
-{
-#if COLS >= LANES
-    for (int col = 0; col + LANES <= COLS; col += LANES) restore_load_square(v + 2 * col, frame, row, col);
-    if (COLS % LANES) restore_load_square(v + 2 * (COLS - LANES), frame, row, COLS - LANES);
-#else
-    for (int col = 0; col < COLS; ++col)
-        for (int i = 0; i < LANES; ++i)
-            ((real *)&v[2 * col])[i] = row + i < ROWS ? (real)frame[(row + i) * COLS + col] : (real)0;
-#endif
-}
-
-#if OUT_LIMIT
-RESTORE_INLINE vec restore_round(const vec v)
-{
-    const vec low = v > (vec)(0) ? v : (vec)(0);
-    return (low < (vec)(OUT_LIMIT) ? low : (vec)(OUT_LIMIT)) + REAL_C(0.5);    // the conversion truncates
-}
-#else
-#define restore_round(V) (V)
-#endif
-
-RESTORE_INLINE void restore_store_square(const vec *lines, __global OUT_TYPE *image, const int row,
-                                         const int col)
-{
-    vec v[LANES];
-    _Pragma("unroll")
-    for (int i = 0; i < LANES; ++i) v[i] = lines[2 * i];
-    restore_transpose(v);
-    _Pragma("unroll")
-    for (int i = 0; i < LANES; ++i)
-        if (row + i < ROWS)
-            *(__global out_vec *)(image + (size_t)(row + i) * COLS + col) =
-                RESTORE_CONVERT(restore_round(v[i]), OUT_TYPE);
-}
-
-RESTORE_INLINE void restore_store(const vec *v, __global OUT_TYPE *image, const int row)
-{
-#if COLS >= LANES
-    for (int col = 0; col + LANES <= COLS; col += LANES) restore_store_square(v + 2 * col, image, row, col);
-    if (COLS % LANES) restore_store_square(v + 2 * (COLS - LANES), image, row, COLS - LANES);
-#else
-    for (int col = 0; col < COLS; ++col) {
-        const vec rounded = restore_round(v[2 * col]);
-        for (int i = 0; i < LANES; ++i)
-            if (row + i < ROWS) image[(row + i) * COLS + col] = (OUT_TYPE)((const real *)&rounded)[i];
-    }
-#endif
-}
-
-// Work-item b transforms rows 2 b LANES onward: the first LANES as real parts, the next as imaginary parts.
-__kernel RESTORE_WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
-restore_rows_forward(
+// Work-item s transforms columns s * STRIP onward: the first LANES as real parts, the next as imaginary parts.
+__kernel WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
+restore_columns_forward(
     __global const IN_TYPE *restrict frame,
-    __global vec           *restrict spectrum,
+    __global stored        *restrict spectrum,
     __global const int     *restrict position,
-    __global const real    *restrict row_turns,
-    __global const real    *restrict row_blend)
+    __global const real    *restrict column_turns,
+    __global const real    *restrict column_blend)
 {
-    vec work[2 * NX], *re = work, *im = work + 1, v[LANES];
-    const int row = 2 * LANES * get_global_id(0);
-    restore_load(re, frame, row);
-    restore_load(im, frame, row + LANES);
-    for (int i = COLS; i < NX; ++i) {
-        const real w = row_blend[i - COLS];
-        re[2 * i] = re[2 * (COLS - 1)] + w * (re[0] - re[2 * (COLS - 1)]);
-        im[2 * i] = im[2 * (COLS - 1)] + w * (im[0] - im[2 * (COLS - 1)]);
+    vec work[2 * NY];
+    const int col = STRIP * get_global_id(0);
+#if COLS % STRIP
+    if (col + STRIP > COLS) {
+        vec *part = work;
+        const int length = NY;
+        restore_gather(work, frame, col, column_blend);
+        COLUMN_FIRST(COLUMN_FORWARD)
+    } else
+#endif
+    {
+        COLUMN_FIRST(COLUMN_LOAD)
     }
-    ROW_PASSES(ROW_FORWARD)
-    // Two real rows in one complex transform come apart by symmetry; the factor 1/2 is in the filter.
-    for (int block = 0; block < BLOCKS; ++block) {
-        __global vec *out = spectrum + 2 * ((size_t)block * HELD + row);
-        __global const int *here = position + block * LANES, *mirror = here + BLOCKS * LANES;
-        for (int i = 0; i < LANES; ++i) v[i] = re[2 * here[i]] + re[2 * mirror[i]];
-        restore_transpose(v);
-        for (int i = 0; i < LANES; ++i) out[2 * i] = v[i];
-        for (int i = 0; i < LANES; ++i) v[i] = im[2 * here[i]] - im[2 * mirror[i]];
-        restore_transpose(v);
-        for (int i = 0; i < LANES; ++i) out[2 * i + 1] = v[i];
-        out += 2 * LANES;
-        for (int i = 0; i < LANES; ++i) v[i] = im[2 * here[i]] + im[2 * mirror[i]];
-        restore_transpose(v);
-        for (int i = 0; i < LANES; ++i) out[2 * i] = v[i];
-        for (int i = 0; i < LANES; ++i) v[i] = re[2 * mirror[i]] - re[2 * here[i]];
-        restore_transpose(v);
-        for (int i = 0; i < LANES; ++i) out[2 * i + 1] = v[i];
+    for (int b = 0; b < NY; b += COLUMN_INNER) {
+        vec *part = work + 2 * b;
+        const int length = COLUMN_INNER;
+        COLUMN_MIDDLE(COLUMN_FORWARD)
+        COLUMN_LAST(COLUMN_FORWARD)
     }
+    // Two real columns in one complex transform come apart by symmetry; the factor 1/2 is in the scale.
+    __global stored *out = spectrum + 4 * (size_t)SLOTS * get_global_id(0);
+    for (int i = 0; i < HELD; ++i) {
+        const vec *p = work + 2 * position[i], *q = work + 2 * position[SLOTS + i];
+        PUT(out, 4 * i, SCALED(p[0] + q[0]));
+        PUT(out, 4 * i + 1, SCALED(p[1] - q[1]));
+        PUT(out, 4 * i + 2, SCALED(p[1] + q[1]));
+        PUT(out, 4 * i + 3, SCALED(q[0] - p[0]));
+    }
+    for (int i = 4 * HELD; i < 4 * SLOTS; ++i) PUT(out, i, (vec)(0));
 }
 
-// Work-item b carries column block b there and back; the rows of the padding are made here, from two others.
-__kernel RESTORE_WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
-restore_columns(
-    __global const vec  *spectrum,
-    __global vec        *filtered,
-    __global const vec  *restrict filter,
-    __global const real *restrict column_turns,
-    __global const real *restrict column_blend)
+// Work-item b carries LANES vertical frequencies there and back; the columns of the padding are made here.
+__kernel WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
+restore_rows(
+    __global const stored *spectrum,
+    __global stored       *filtered,
+    __global const vec    *restrict filter,
+    __global const real   *restrict long_axis,
+    __global const vec    *restrict short_axis,
+    __global const real   *restrict row_turns,
+    __global const real   *restrict row_blend,
+    const real noise, const real scale)
 {
-    vec work[2 * NY], *re = work, *im = work + 1;
+    vec work[2 * (STRIPS * STRIP > NX ? STRIPS * STRIP : NX)], r[LANES], i[LANES];
     const size_t block = get_global_id(0);
-    __global const vec *source = spectrum + 2 * block * HELD;
-    __global const vec *block_filter = filter + 2 * block * NY;
-    for (int y = 0; y < ROWS; ++y) {
-        re[2 * y] = source[2 * y];
-        im[2 * y] = source[2 * y + 1];
+    for (int x = 0; x < STRIPS * STRIP; x += LANES) {
+        __global const stored *in = spectrum + 4 * (x / STRIP * SLOTS + block * LANES) + x / LANES % 2 * 2;
+        _Pragma("unroll")
+        for (int k = 0; k < LANES; ++k) {
+            PREFETCH(in + 8 * SLOTS + 4 * k);
+            r[k] = GET(in, 4 * k);
+            i[k] = GET(in, 4 * k + 1);
+        }
+        restore_transpose(r);
+        restore_transpose(i);
+        _Pragma("unroll")
+        for (int k = 0; k < LANES; ++k) {
+            work[2 * (x + k)] = r[k];
+            work[2 * (x + k) + 1] = i[k];
+        }
     }
-    for (int y = ROWS; y < NY; ++y) {
-        const real w = column_blend[y - ROWS];
-        re[2 * y] = re[2 * (ROWS - 1)] + w * (re[0] - re[2 * (ROWS - 1)]);
-        im[2 * y] = im[2 * (ROWS - 1)] + w * (im[0] - im[2 * (ROWS - 1)]);
+    for (int x = COLS; x < NX; ++x) {
+        const real w = row_blend[x - COLS];
+        work[2 * x] = work[2 * COLS - 2] + w * (work[0] - work[2 * COLS - 2]);
+        work[2 * x + 1] = work[2 * COLS - 1] + w * (work[1] - work[2 * COLS - 1]);
     }
-    COLUMN_PASSES(COLUMN_FORWARD)
-    COLUMN_LAST(COLUMN_FILTER)
-    COLUMN_PASSES_BACK(COLUMN_BACK)
-    __global vec *out = filtered + 2 * block * HELD;
-    for (int y = 0; y < ROWS; ++y) {
-        out[2 * y] = re[2 * y];
-        out[2 * y + 1] = im[2 * y];
+    {
+        vec *part = work;
+        const int length = NX;
+        ROW_FIRST(ROW_FORWARD)
     }
-    for (int y = 2 * ROWS; y < 2 * HELD; ++y) out[y] = (vec)(0);
+    __global const vec *block_filter = filter + 2 * block * NX;
+    for (int b = 0; b < NX; b += ROW_INNER) {
+        vec *part = work + 2 * b;
+        const int length = ROW_INNER;
+        ROW_MIDDLE(ROW_FORWARD)
+        if (filter) {
+            ROW_LAST(ROW_FILTER)
+        } else {
+            const vec hr = short_axis[2 * block], hi = short_axis[2 * block + 1];
+            ROW_LAST(ROW_WIENER)
+        }
+        ROW_MIDDLE_BACK(ROW_BACK)
+    }
+    {
+        vec *part = work;
+        const int length = NX;
+        ROW_FIRST(ROW_BACK)
+    }
+    for (int x = 0; x < STRIPS * STRIP; x += LANES) {
+        __global stored *out = filtered + 4 * (x / STRIP * SLOTS + block * LANES) + x / LANES % 2 * 2;
+        _Pragma("unroll")
+        for (int k = 0; k < LANES; ++k) {
+            r[k] = work[2 * (x + k)];
+            i[k] = work[2 * (x + k) + 1];
+        }
+        restore_transpose(r);
+        restore_transpose(i);
+        _Pragma("unroll")
+        for (int k = 0; k < LANES; ++k) {
+            PUT(out, 4 * k, r[k]);
+            PUT(out, 4 * k + 1, i[k]);
+        }
+    }
 }
 
-// Work-item b puts rows 2 b LANES onward together again: the same pairs, the same order, backwards.
-__kernel RESTORE_WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
-restore_rows_inverse(
-    __global const vec  *restrict filtered,
-    __global OUT_TYPE   *restrict image,
-    __global const int  *restrict position,
-    __global const real *restrict row_turns)
+// Work-item s puts columns s * STRIP onward together again: the same pairs, the same order, backwards.
+__kernel WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
+restore_columns_inverse(
+    __global const stored *restrict filtered,
+    __global OUT_TYPE     *restrict image,
+    __global const int    *restrict position,
+    __global const real   *restrict column_turns)
 {
-    vec work[2 * NX], *re = work, *im = work + 1, ar[LANES], ai[LANES], br[LANES], bi[LANES];
-    const int row = 2 * LANES * get_global_id(0);
-    for (int block = 0; block < BLOCKS; ++block) {
-        __global const vec *in = filtered + 2 * ((size_t)block * HELD + row);
-        for (int i = 0; i < LANES; ++i) {
-            ar[i] = in[2 * i];
-            ai[i] = in[2 * i + 1];
-            br[i] = in[2 * (LANES + i)];
-            bi[i] = in[2 * (LANES + i) + 1];
-        }
-        restore_transpose(ar);
-        restore_transpose(ai);
-        restore_transpose(br);
-        restore_transpose(bi);
-        __global const int *here = position + block * LANES, *mirror = here + BLOCKS * LANES;
-        for (int i = 0; i < LANES && block * LANES + i <= NX / 2; ++i) {
-            const int p = here[i], q = mirror[i];
-            re[2 * p] = p == q ? ar[i] : ar[i] - bi[i];     // a bin that mirrors itself is real
-            im[2 * p] = p == q ? br[i] : ai[i] + br[i];
-            if (p != q) {
-                re[2 * q] = ar[i] + bi[i];
-                im[2 * q] = br[i] - ai[i];
-            }
-        }
+    vec work[2 * NY];
+    const int col = STRIP * get_global_id(0);
+    __global const stored *in = filtered + 4 * (size_t)SLOTS * get_global_id(0);
+    for (int i = 0; i < HELD; ++i) {
+        vec *p = work + 2 * position[i], *q = work + 2 * position[SLOTS + i];
+        const vec ar = GET(in, 4 * i), ai = GET(in, 4 * i + 1), br = GET(in, 4 * i + 2), bi = GET(in, 4 * i + 3);
+        q[0] = ar + bi;
+        q[1] = br - ai;
+        p[0] = p == q ? ar : ar - bi;     // a bin that mirrors itself is real
+        p[1] = p == q ? br : ai + br;
     }
-    ROW_PASSES_BACK(ROW_BACK)
-    restore_store(re, image, row);
-    restore_store(im, image, row + LANES);
+    for (int b = 0; b < NY; b += COLUMN_INNER) {
+        vec *part = work + 2 * b;
+        const int length = COLUMN_INNER;
+        COLUMN_LAST(COLUMN_BACK)
+        COLUMN_MIDDLE_BACK(COLUMN_BACK)
+    }
+#if COLS % STRIP
+    if (col + STRIP > COLS) {
+        vec *part = work;
+        const int length = NY;
+        COLUMN_FIRST(COLUMN_BACK)
+        restore_scatter(work, image, col);
+    } else
+#endif
+    {
+        COLUMN_FIRST(COLUMN_UNLOAD)
+    }
 }

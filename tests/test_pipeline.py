@@ -126,13 +126,13 @@ def test_a_filter_is_formed_anew_when_its_blur_changed_and_only_then(
 ) -> None:
     pipeline = CameraPipeline(device, OPTICS, (64, 80), (PEG, HOLE))
     formed: list[int] = []
-    form = pipeline._restore.set_filter_axes_device
+    form = pipeline._restore.set_filter_table
 
-    def counted(h_rows: object, h_columns: object, nsr: float, slot: int, **rest: object) -> None:
+    def counted(table: object, nsr: float, slot: int) -> None:
         formed.append(slot)
-        form(h_rows, h_columns, nsr, slot, **rest)  # type: ignore[arg-type]  # passed on as they came
+        form(table, nsr, slot)  # type: ignore[arg-type]  # passed on as they came
 
-    monkeypatch.setattr(pipeline._restore, "set_filter_axes_device", counted)
+    monkeypatch.setattr(pipeline._restore, "set_filter_table", counted)
     pixels = np.random.default_rng(1).integers(0, 255, (64, 80), dtype=np.uint8)
     blurs = {PEG: Blur(20.0, 0.0), HOLE: Blur(20.0, 30.0)}
     first = pipeline.restored(pixels, blurs)

@@ -79,6 +79,38 @@ def test_every_size_agrees_with_the_numpy_page(
     assert relative_l2(plan.restore(frame), wanted) <= tolerances.restore_relative_l2(precision)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("shape", [(23, 37), (96, 128), (127, 251)], ids=str)
+def test_a_spectrum_in_halves_stays_within_three_of_255_grey_levels(
+    device: Device, family: str, shape: tuple[int, int], dtype: type
+) -> None:
+    top = np.iinfo(dtype).max
+    plan = Restore(device, shape, family=family, in_dtype=dtype, out_dtype=dtype, spectrum_dtype=np.float16)
+    rows, columns = cubic_axes(plan.padded_shape)
+    plan.set_filter_axes(rows, columns, 0.01)
+    rng = np.random.default_rng(3)
+    # As bright as it can be: nothing may overflow.
+    frame = rng.integers(top // 2, top, shape, dtype=dtype, endpoint=True)
+    frame[5:12, 7:20] = top
+    gain = reference.wiener_of_axes(rows, columns, 0.01)
+    wanted = np.clip(reference.restore(frame, gain, plan.padded_shape), 0, top)
+    found = plan.restore(frame).astype(np.float64)
+    assert np.abs(found - wanted).max() <= 3 * top / 255
+    assert relative_l2(found, wanted) <= 3e-3
+
+
+def test_an_image_larger_than_the_caches_is_streamed_and_the_same(device: Device) -> None:
+    shape = (40, 4 * 64)
+    results = []
+    for size in (device.facts.cache_bytes, 1):
+        opened = copy.copy(device)
+        opened.facts = replace(device.facts, cache_bytes=size)
+        plan = Restore(opened, shape, family="lanes")
+        plan.set_filter_axes(*cubic_axes(plan.padded_shape), 0.02)
+        results.append(plan.restore(random_frame(shape)))
+    np.testing.assert_array_equal(results[1], results[0])
+
+
 @pytest.mark.parametrize("taper", [True, False])
 def test_the_padding_is_that_of_the_numpy_page(device: Device, family: str, taper: bool) -> None:
     plan = plan_of(device, family, taper=taper)
@@ -235,11 +267,10 @@ def test_axes_on_the_device_and_a_table_give_the_filter_the_host_would(device: D
     frame = random_frame(SHAPE)
     plan.set_filter_axes(rows, columns, 0.02, slot=3)
     wanted = plan.restore(frame, slot=3)
-    table_rows = device.upload(np.stack([0 * rows, rows]))
-    table_columns = device.upload(np.stack([0 * columns, 0 * columns, columns]))
-    plan.set_filter_axes_device(table_rows, table_columns, 0.02, slot=4, row_entry=1, col_entry=2)
+    pair = np.concatenate([rows, columns])
+    plan.set_filter_table(device.upload(np.stack([0 * pair, pair, 0 * pair])), 0.02, slot=4, entry=1)
     np.testing.assert_array_equal(plan.restore(frame, slot=4), wanted)
-    plan.set_filter_axes_device(device.upload(rows), device.upload(columns), 0.02, slot=4)
+    plan.set_filter_table(device.upload(pair), 0.02, slot=4)
     np.testing.assert_array_equal(plan.restore(frame, slot=4), wanted)
 
 
@@ -319,6 +350,9 @@ def test_the_family_follows_from_the_kind_of_device(device: Device) -> None:
         ({"out_dtype": np.float64}, "out_dtype"),
         ({"family": "threads"}, "family"),
         ({"precision": "half"}, "precision"),
+        ({"spectrum_dtype": np.float16}, "65504"),
+        ({"spectrum_dtype": np.float64}, "spectrum_dtype"),
+        ({"spectrum_dtype": np.float16, "precision": "float64"}, "spectrum_dtype"),
     ],
 )
 def test_a_plan_beyond_the_limits_is_refused(device: Device, options: dict[str, Any], said: str) -> None:
@@ -373,18 +407,23 @@ def test_a_wrong_filter_is_refused_and_the_old_one_stays(device: Device, gain: n
     assert relative_l2(plan.restore(frame), 2 * frame) <= tolerances.restore_relative_l2("float32")
 
 
-def test_wrong_tables_on_the_device_are_refused(device: Device) -> None:
+def test_a_wrong_table_on_the_device_is_refused_and_the_filter_stays(device: Device) -> None:
     plan = plan_of(device, "lanes")
-    rows, columns = device.upload(ROWS.astype(np.complex64)), device.upload(COLUMNS.astype(np.complex64))
+    plan.set_filter(np.full(HALF, 2.0))
+    pair = np.concatenate([ROWS, COLUMNS]).astype(np.complex64)
+    table = device.upload(pair)
     for arguments, options, said in (
-        ((columns, columns, 0.1), {}, "h_rows"),
-        ((rows, device.upload(COLUMNS.astype(np.float32)), 0.1), {}, "h_cols"),
-        ((rows, columns, 0.1), {"row_entry": 1}, "entry 1"),
-        ((rows, columns, rows), {}, "nsr"),
-        ((rows, columns, -1.0), {}, "nsr"),
+        ((device.upload(pair[1:]), 0.1), {}, "rows, then of columns"),
+        ((device.upload(pair.astype(np.complex128)), 0.1), {}, "complex64"),
+        ((table, 0.1), {"entry": 1}, "entry 1"),
+        ((table, table), {}, "nsr"),
+        ((table, -1.0), {}, "nsr"),
+        ((table, 0.1), {"slot": 0.5}, "slot"),
     ):
         with pytest.raises(InputError, match=said):
-            plan.set_filter_axes_device(*arguments, **options)
+            plan.set_filter_table(*arguments, **options)
+    frame = random_frame(SHAPE)
+    assert relative_l2(plan.restore(frame), 2 * frame) <= tolerances.restore_relative_l2("float32")
 
 
 def test_a_wrong_frame_an_empty_slot_and_a_missing_transform_are_refused(device: Device) -> None:
@@ -412,9 +451,9 @@ def test_a_wrong_frame_an_empty_slot_and_a_missing_transform_are_refused(device:
 # ---- the plan of the passes, on the host ------------------------------------------------------------------
 
 
-@given(n=st.integers(2, 5000).map(good_size))
-def test_the_passes_are_a_discrete_fourier_transform(n: int) -> None:
-    plan = Passes.of(n)
+@given(n=st.integers(2, 5000).map(good_size), registers=st.sampled_from([0, 16, 32]))
+def test_the_passes_are_a_discrete_fourier_transform(n: int, registers: int) -> None:
+    plan = Passes.of(n, registers)
     turns = plan.turns()
     x = np.random.default_rng(n).normal(size=n) + 1j
     work = x.copy()
@@ -423,7 +462,8 @@ def test_the_passes_are_a_discrete_fourier_transform(n: int) -> None:
         table = turns[offset : offset + 2 * (radix - 1) * stride].reshape(stride, radix - 1, 2)
         blocks[:] = np.fft.fft(blocks, axis=1)
         blocks[:, 1:] *= (table[..., 0] + 1j * table[..., 1]).T
-    assert np.prod(radices_of(n), initial=1) == n
+    assert np.prod(radices_of(n, registers), initial=1) == n
+    assert len(plan.radices) > 1 or n in (2, 3, 5, 7)
     assert relative_l2(work[plan.position()], np.fft.fft(x)) < tolerances.fft_relative_l2("float64", n)
     np.testing.assert_array_equal(plan.position()[plan.order()], np.arange(n))
 

@@ -40,13 +40,19 @@ SLIPS = [
     ("psf.cl", "psf_field", "amplitude[i] * turns_cis(turns[i])", "turns_cis(turns[i])"),
     ("psf.cl", "psf_fft", "along_rows ? 1 : m, m, s, j, sign", "along_rows ? 1 : m, m, s, j, -sign"),
     ("psf.cl", "psf_intensity", "psf[i] = value.x;", "psf[i] = value.x * REAL_C(1.00001);"),
-    ("wiener.cl", "wiener_axes", "g.im[i] = v.x * u.im[i] +", "g.im[i] = v.x * u.im[i] -"),
-    ("wiener.cl", "wiener_spectrum", "g.im[i] = h.y;", "g.im[i] = -h.y;"),
-    ("wiener.cl", "wiener_arrange", "? scale * gain[start + i]", "? gain[start + i]"),
-    ("restore_lanes.cl", "restore_rows_forward", "re[2 * mirror[i]] - re[2 * here[i]]", "re[2 * mirror[i]]"),
-    ("restore_lanes.cl", "restore_columns", "column_blend[y - ROWS]", "0"),
-    ("restore_lanes.cl", "restore_rows_inverse", "p == q ? br[i] :", "p == q ? 0 :"),
-    ("restore_groups.cl", "restore_rows_forward", "= re[q] - re[p];", "= re[q];"),
+    ("wiener.cl", "wiener_axes", "wiener_axis(h_cols + cols_from, X, nx)),", "wiener_axis(h_rows, X, nx)),"),
+    ("wiener.cl", "wiener_pair", "h_long, long_frequency[i]", "h_long, i"),
+    (
+        "wiener.cl",
+        "wiener_spectrum",
+        "otf[WIENER_AT(Y, X)], WIENER_NOISE",
+        "otf[WIENER_AT(X, Y)], WIENER_NOISE",
+    ),
+    ("wiener.cl", "wiener_arrange", "(scale * gain[WIENER_AT(Y, X)])", "(gain[WIENER_AT(Y, X)])"),
+    ("restore_lanes.cl", "restore_columns_forward", "SCALED(q[0] - p[0])", "SCALED(q[0])"),
+    ("restore_lanes.cl", "restore_rows", "row_blend[x - COLS]", "0"),
+    ("restore_lanes.cl", "restore_columns_inverse", "p == q ? br :", "p == q ? 0 :"),
+    ("restore_groups.cl", "restore_rows_forward", "SCALED(re[q] - re[p])", "SCALED(re[q])"),
     ("restore_groups.cl", "restore_columns", "column_blend[y - ROWS]", "0"),
     ("restore_groups.cl", "restore_rows_inverse", "p == q ? br :", "p == q ? 0 :"),
     ("image_prep.cl", "image_prep", "(top + row) * frame_columns + left", "row * frame_columns + left"),
@@ -109,7 +115,8 @@ def test_every_kernel_function_is_launched_and_named_by_its_outcome(
         return launch
 
     def recorded_enqueue(self: Launch) -> Any:
-        launched.update(name for launch, name in known if launch is self)
+        # What a plan asks of the compiler itself is in no file.
+        launched.update(name for launch, name in known if launch is self and name[0].endswith(".cl"))
         return enqueue(self)
 
     monkeypatch.setattr(Program, "launch", recorded_bind)
