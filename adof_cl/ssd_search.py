@@ -19,8 +19,9 @@ LARGEST_TEMPLATE = 64
 _IMAGE_KINDS = {np.dtype(np.uint8): 0, np.dtype(np.uint16): 1, np.dtype(np.float32): 2}
 # Offset rows x vectors that a work-item of the lanes family computes at once: their sums stay in registers.
 _BLOCKS = ((3, 3), (5, 2), (9, 1), (2, 3), (3, 2), (2, 2), (4, 1))
-_TILE_TAPS = 2**20  # a work-item's pixels times offsets: below this, it costs no more than one launch more
-_WIDEST_TILE = 128  # offsets: the window's rows stay in the cache
+# A work-item's tile of a window: below so many taps times offsets one tile costs less than a second launch,
+# and up to so many offsets, and so many in a row, its pixels and sums stay in the cache.
+_TILE_TAPS, _TILE_OFFSETS, _TILE_COLUMNS = 2**20, 4096, 128
 _GROUP_TILE = (16, 32)
 _GROUP_SIZE = (32, 4)
 _BEST_ITEMS = 64
@@ -117,7 +118,7 @@ class SsdSearch:
         self.offsets_shape = (self.search_shape[0] - rows + 1, self.search_shape[1] - columns + 1)
         defines: dict[str, int]
         if self.family == "lanes":
-            # No vector of OpenCL C holds the 32 pairs of bytes' halves that 64 bytes would take.
+            # Bytes are taken as shorts, and no vector of OpenCL C holds more than 16.
             width = min(vector_bytes(device), 32) if self.dtype == np.uint8 else vector_bytes(device)
             centred = score == "gain_offset" and self.dtype != np.uint8  # two sums an offset, and its mean
             fitting = (4 if centred else 9) * (2 if width == 64 else 1)
@@ -366,8 +367,9 @@ class SsdSearch:
 
     def _decoded(self, bits: NDArray[np.int32]) -> NDArray[np.float64]:
         integers = self.dtype == np.uint8 and self.score == "ssd"
-        values = bits.astype(np.float64) if integers else np.ascontiguousarray(bits).view(np.float32)
-        return np.where(bits == _SCORE_NONE, np.inf, values.astype(np.float64))
+        values = (bits if integers else bits.view(np.float32)).astype(np.float64)
+        np.copyto(values, np.inf, where=bits == _SCORE_NONE)
+        return values
 
 
 def _lanes_tile(
@@ -384,9 +386,9 @@ def _lanes_tile(
         key=lambda b: math.prod(covered(b)) * (1 + 1 / b[0] + 1 / b[1]),
     )
     rows, columns = covered(block)
-    most = max(_TILE_TAPS // math.prod(template), math.prod(block) * lanes)
-    if rows * columns > most or columns > _WIDEST_TILE:
-        columns = _share(columns, min(_WIDEST_TILE, most // block[0]), block[1] * lanes)
+    most = max(min(_TILE_TAPS // math.prod(template), _TILE_OFFSETS), math.prod(block) * lanes)
+    if rows * columns > most or columns > _TILE_COLUMNS:
+        columns = _share(columns, min(_TILE_COLUMNS, most // block[0]), block[1] * lanes)
         rows = _share(rows, most // columns, block[0])
     return block, (rows, columns)
 

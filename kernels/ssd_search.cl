@@ -9,7 +9,7 @@
 //   templates   (count, TEMPLATE_ROWS, TEMPLATE_COLUMNS) float   T; less its mean for gain_offset of other than uchar
 //   sums        (count, 2) int     uchar: sum T, sum T^2; else: bits of the float sum T'^2 of the stored T', unused
 //   origins     (count, 2) int     row, column of each window's corner; the host keeps windows inside the image
-//   scores      (count, offset_rows, map_columns) int       columns rounded up to whole tiles; ssd of
+//   scores      (count, offset_rows, map_columns) int       offset_columns in each row, rounded up to whole tiles; ssd of
 //                                                      uchar: the integer; else the bits of a float >= 0
 //   tile_best   (count, tiles, 2) int                       a tile's smallest score and its row-major place in the map
 //   records     (count, 11 + PATCH_ROWS * PATCH_COLUMNS) int   row, column of the best place in the image; the 3 x 3
@@ -172,7 +172,8 @@ ALWAYS_INLINE void write_record(
     for (int r = 0; r < PATCH_ROWS; ++r) {
         __global const pixel *from = image + clamp(top - PATCH_MARGIN + r, 0, image_rows - 1) * image_columns;
         for (int c = item; c < PATCH_COLUMNS; c += items)
-            record[11 + r * PATCH_COLUMNS + c] = as_int((float)from[clamp(left - PATCH_MARGIN + c, 0, image_columns - 1)]);
+            record[11 + r * PATCH_COLUMNS + c] =
+                as_int((float)from[clamp(left - PATCH_MARGIN + c, 0, image_columns - 1)]);
     }
 #endif
 }
@@ -210,7 +211,7 @@ typedef ivec ivec_any __attribute__((aligned(4)));
 typedef JOIN(PIXEL, LANES) pixels_any __attribute__((aligned(sizeof(pixel))));
 
 #if IMAGE_KIND == 0
-// A cell holds a pixel and its right neighbour, and so does a tap: two products and their sum are one instruction on
+// A cell holds a pixel and its right neighbour, and so does a tap: two products and their sum are one instruction of
 // most processors.
 #if LANES == 8
 typedef short16 cells;
@@ -224,8 +225,8 @@ typedef short8 cells;
 typedef short2 cell;
 #define CELL_PIXELS 2
 
-// sum + a.even * b.even + a.odd * b.odd, from 0 to 2^31. Added as 64-bit numbers, where nothing carries from half to
-// half: else a compiler adds the two products one after the other and misses that instruction.
+// sum + a.even * b.even + a.odd * b.odd, for sums from 0 to 2^31. Added as 64-bit numbers, where then nothing carries
+// from half to half: else a compiler adds the two products one after the other and misses that instruction.
 ALWAYS_INLINE ivec multiply_add(const ivec sum, const cells a, const cells b)
 {
     const ivec products = CONVERT(a.even, int) * CONVERT(b.even, int) + CONVERT(a.odd, int) * CONVERT(b.odd, int);
@@ -304,18 +305,15 @@ ALWAYS_INLINE void footprint_sums(const cell *window, const int squared, number 
 {
     #pragma unroll 1
     for (int x = 0; x < TILE_COLUMNS; x += LANES) {
-        numbers along[WINDOW_ROWS], total = 0;
+        numbers along[WINDOW_ROWS], total;
         #pragma unroll 1
         for (int y = 0; y < WINDOW_ROWS; ++y) along[y] = sum_along(window + y * PITCH + x, squared);
         #pragma unroll 1
         for (int k = 0; k < TILE_ROWS; ++k) {
-#if IMAGE_KIND == 0
-            if (k > 0) total += along[k + TEMPLATE_ROWS - 1] - along[k - 1];
-            else
-#else
-            total = 0;
-#endif
-            {
+            if (IMAGE_KIND == 0 && k > 0) {
+                total += along[k + TEMPLATE_ROWS - 1] - along[k - 1];
+            } else {
+                total = 0;
                 #pragma unroll 1
                 for (int r = 0; r < TEMPLATE_ROWS; ++r) total += along[k + r];
             }
@@ -437,7 +435,7 @@ ssd_search(
                 min(TILE_COLUMNS + TEMPLATE_COLUMNS - 1, offset_columns + TEMPLATE_COLUMNS - 1 - x0), level, window);
 
 #if IMAGE_KIND == 0
-    cells pairs[TEMPLATE_ROWS * TAP_COLUMNS];
+    cells pairs[TEMPLATE_ROWS * TAP_COLUMNS];   // whole vectors: taps spread at their use miss that instruction too
     #pragma unroll 1
     for (int i = 0; i < TEMPLATE_ROWS * TAP_COLUMNS; ++i) {
         const int c = i % TAP_COLUMNS * 2;
