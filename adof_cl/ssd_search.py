@@ -152,7 +152,7 @@ class SsdSearch:
         self._origins_on_device = device.upload(self._origins)
         self._scores = device.empty((count, self.offsets_shape[0], map_columns), np.int32)
         tile_best = device.empty((count, tiles_y * tiles_x, 2), np.int32)
-        self._records = device.empty((count, 11 + patch), np.int32)
+        self._records = device.shared((count, 11 + patch), np.int32)
         self._fetched = np.empty(self._records.shape, np.int32)
         self._image: DeviceArray | None = None
 
@@ -338,7 +338,7 @@ class SsdSearch:
             self._best()
 
     def fetch(self) -> SearchResult:
-        """Wait for the last search and return what it found, by one small download."""
+        """Wait for the last search and return what it found."""
         records = self._records.download(self._fetched)
         neighbourhood = self._decoded(records[:, 2:11]).reshape(self.count, 3, 3)
         patches = None
