@@ -147,6 +147,12 @@ ALWAYS_INLINE float window_level(__global const pixel *image, __global const int
 }
 #endif
 
+// The index nearest to `i` of 0 to n - 1; clamp is a call on some compilers.
+ALWAYS_INLINE int nearest(const int i, const int n)
+{
+    return i < 0 ? 0 : i < n ? i : n - 1;
+}
+
 // One work-item of `items` writes its share of a template's record: where the best place lies, the scores around it,
 // and the pixels; beyond the image's edge these repeat the last one.
 ALWAYS_INLINE void write_record(
@@ -169,11 +175,13 @@ ALWAYS_INLINE void write_record(
         }
     }
 #if PATCH_ROWS > 0
+    const int start = left - PATCH_MARGIN;
+    const int inside = start >= 0 && start + PATCH_COLUMNS <= image_columns;
     for (int r = 0; r < PATCH_ROWS; ++r) {
-        __global const pixel *from = image + clamp(top - PATCH_MARGIN + r, 0, image_rows - 1) * image_columns;
+        __global const pixel *from = image + nearest(top - PATCH_MARGIN + r, image_rows) * image_columns;
+        __global int *to = record + 11 + r * PATCH_COLUMNS;
         for (int c = item; c < PATCH_COLUMNS; c += items)
-            record[11 + r * PATCH_COLUMNS + c] =
-                as_int((float)from[clamp(left - PATCH_MARGIN + c, 0, image_columns - 1)]);
+            to[c] = as_int((float)from[inside ? start + c : nearest(start + c, image_columns)]);
     }
 #endif
 }
