@@ -196,8 +196,7 @@ class DeviceArray:
                 f"an array of {self.nbytes} bytes was asked for, {device.facts} allocates at most "
                 f"{device.facts.max_allocation_bytes}: use a smaller frame or another device"
             )
-        self.buffer = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 1))
-        device.made(self.buffer)
+        self.buffer = self._allocated()
 
     def upload(self, values: NDArray[Any]) -> DeviceArray:
         """Copy `values` (same shape and dtype) to the device; returns when the host may reuse them."""
@@ -206,7 +205,7 @@ class DeviceArray:
                 f"an array of shape {values.shape} and type {values.dtype} came, {self.shape} and "
                 f"{self.dtype} was wanted: convert it first"
             )
-        cl.enqueue_copy(self.device.queue, self.buffer, np.ascontiguousarray(values), is_blocking=True)
+        self._copy_from(np.ascontiguousarray(values))
         return self
 
     def download(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
@@ -218,8 +217,19 @@ class DeviceArray:
                 f"out is {out.shape} {out.dtype}, a C-ordered {self.shape} {self.dtype} was wanted: "
                 "allocate it like the device array"
             )
-        cl.enqueue_copy(self.device.queue, out, self.buffer, is_blocking=True)
+        self._copy_to(out)
         return out
+
+    def _allocated(self) -> Any:
+        buffer = cl.Buffer(self.device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 1))
+        self.device.made(buffer)
+        return buffer
+
+    def _copy_from(self, values: NDArray[Any]) -> None:
+        cl.enqueue_copy(self.device.queue, self.buffer, values, is_blocking=True)
+
+    def _copy_to(self, out: NDArray[Any]) -> None:
+        cl.enqueue_copy(self.device.queue, out, self.buffer, is_blocking=True)
 
 
 class Device:
@@ -242,6 +252,7 @@ class Device:
         self.vector_bytes: int | None = None
         self.context = cl.Context([handle])
         self._kept: list[cl.Buffer] = []
+        self._shares_memory = facts.kind == "cpu" and _shares_memory(handle)
         if profiling:
             properties = cl.command_queue_properties.PROFILING_ENABLE
             self.queue = cl.CommandQueue(self.context, handle, properties=properties)
@@ -273,6 +284,10 @@ class Device:
         """Allocate an uninitialised array."""
         return DeviceArray(self, shape, dtype)
 
+    def shared(self, shape: tuple[int, ...], dtype: DTypeLike) -> DeviceArray:
+        """Allocate an uninitialised array for small results: where the device can, one that needs no copy."""
+        return SharedArray(self, shape, dtype) if self._shares_memory else self.empty(shape, dtype)
+
     def upload(self, values: NDArray[Any]) -> DeviceArray:
         """Allocate an array like `values` and copy them to it."""
         return DeviceArray(self, values.shape, values.dtype).upload(values)
@@ -296,3 +311,29 @@ class Device:
         if precision == "float64" and not self.facts.fp64:
             raise DeviceError(f"{self.facts} has no float64 arithmetic: use precision 'float32'")
         return np.dtype(precision)
+
+
+class SharedArray(DeviceArray):
+    """An array in memory that a CPU's kernels share with the host: a download is a wait and no command more.
+
+    Some runtimes wake a worker anew for such a command, which takes longer than a small kernel.
+    """
+
+    def _allocated(self) -> Any:
+        self._host: NDArray[Any] = cl.fsvm_empty(self.device.context, self.shape, self.dtype)
+        return cl.SVM(self._host)
+
+    def _copy_from(self, values: NDArray[Any]) -> None:
+        self.device.wait()
+        self._host[...] = values
+
+    def _copy_to(self, out: NDArray[Any]) -> None:
+        self.device.wait()
+        out[...] = self._host
+
+
+def _shares_memory(device: cl.Device) -> bool:
+    try:
+        return bool(int(device.svm_capabilities) & int(cl.device_svm_capabilities.FINE_GRAIN_BUFFER))
+    except cl.Error:  # OpenCL 1.2 knows no such memory
+        return False

@@ -12,6 +12,9 @@ from hypothesis import strategies as st
 
 from adof_cl.device import Device, DeviceFacts, choose, list_devices
 from adof_cl.errors import DeviceError, InputError
+from adof_cl.program import Program
+
+_ADD = "__kernel void add(__global int *values) { values[get_global_id(0)] += 1; }\n"
 
 
 def facts(index: int, name: str, platform: str, kind: str, *, simulated: bool = False) -> DeviceFacts:
@@ -90,8 +93,25 @@ def test_what_is_uploaded_comes_back(device: Device) -> None:
     assert np.array_equal(device.upload(values).download(), values)
 
 
-def test_an_array_of_another_shape_or_type_is_refused_and_nothing_changed(device: Device) -> None:
-    array = device.upload(np.arange(6, dtype=np.float32).reshape(2, 3))
+@pytest.mark.parametrize("shares", [True, False])
+def test_a_shared_array_holds_what_kernels_wrote_and_keeps_what_came_before(
+    device: Device, monkeypatch: pytest.MonkeyPatch, shares: bool
+) -> None:
+    monkeypatch.setattr(device, "_shares_memory", shares and device._shares_memory)
+    array = device.shared((1000,), np.int32)
+    add = Program(device, "precision.h", generated=("add.cl", _ADD)).launch("add", (1000,), (1,), array)
+    array.upload(np.arange(1000, dtype=np.int32))
+    earlier = []
+    for _ in range(3):
+        add()
+        earlier.append(array.download())
+    for n, values in enumerate(earlier):
+        assert np.array_equal(values, np.arange(1000) + n + 1)
+
+
+@pytest.mark.parametrize("made", ["empty", "shared"])
+def test_an_array_of_another_shape_or_type_is_refused_and_nothing_changed(device: Device, made: str) -> None:
+    array = getattr(device, made)((2, 3), np.float32).upload(np.arange(6, dtype=np.float32).reshape(2, 3))
     for wrong in (np.zeros((3, 2), np.float32), np.zeros((2, 3), np.float64)):
         with pytest.raises(InputError, match="was wanted"):
             array.upload(wrong)

@@ -58,6 +58,7 @@ SLIPS = [
     ("image_prep.cl", "image_prep", "(top + row) * frame_columns + left", "row * frame_columns + left"),
     # lanes, then groups
     ("ssd_search.cl", "ssd_search", "- 2 * cross[k][j];", "- 2 * cross[k][j] + 1;"),
+    ("ssd_search.cl", "ssd_search", "if (c + 1 == TEMPLATE_COLUMNS) value.odd = 0;", ""),
     (
         "ssd_search.cl",
         "ssd_search",
@@ -122,7 +123,7 @@ def test_every_kernel_function_is_launched_and_named_by_its_outcome(
     monkeypatch.setattr(Program, "launch", recorded_bind)
     monkeypatch.setattr(Launch, "__call__", recorded_enqueue)
     named = {kernel for o in selftest.run(device, small=True) for kernel in o.kernels}
-    assert launched == KERNELS
+    assert {(file, kernel) for file, kernel in launched if file.endswith(".cl")} == KERNELS
     assert named == {kernel for _, kernel in KERNELS}
 
 
