@@ -139,7 +139,7 @@ class Restore:
         clamped on the way out.
     padding
         Samples to add at least to each axis, one number or (rows, columns): the support of the blur, which
-        must not reach across the wrap. The padded size is the next product of 2, 3, 5 and 7.
+        must not reach across the wrap. The padded size is a product of 2, 3, 5 and 7 (`good_size`).
     taper
         True: the padding passes smoothly from the far edge to the near one. False: it replicates them, half
         each, and steps in the middle.

@@ -2,8 +2,8 @@
 
 python benchmarks/chain_parts.py [--device D] [--size 512x400] [--frames 300]
 
-The frame chain of `adof bench` (upload, restore, four searches, places down) on a queue that keeps the device's
-own clock; medians. "between" is the host's wall time less all of them: enqueuing, waking, waiting.
+The frame chain of `adof bench` (upload, restore, four searches, places down) on a queue that keeps the
+device's own clock; medians. "between" is the host's wall time less all of them: enqueuing, waking, waiting.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from adof_cl.ssd_search import SsdSearch
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    form = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=form)
     parser.add_argument("--device", help="index, type or part of a name")
     parser.add_argument("--size", default="512x400", help="columns x rows")
     parser.add_argument("--frames", type=int, default=300)

@@ -2,8 +2,8 @@
 
 python benchmarks/scaling.py [--device D] [--json FILE] [--plot FILE]
 
-All sizes take turns in one process; a size's time is the median of its rounds. If only the arithmetic counted,
-ns per pixel and pass level, the last column, would be one number.
+All sizes take turns in one process; a size's time is the median of its rounds. If only the arithmetic
+counted, ns per pixel and level of the transforms, the last column, would be one number.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ def contender(device: Device, side: int, kind: str) -> tuple[object, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    form = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=form)
     parser.add_argument("--device", help="index, type or part of a name")
     parser.add_argument("--json", type=Path, help="write the table as JSON")
     parser.add_argument("--plot", type=Path, help="draw ns per pixel against the side")
@@ -63,7 +64,8 @@ def main() -> None:
             cells.append(f"{1e3 * seconds:10.3f}{pixel:8.2f}{pixel / (2 * math.log2(side)):10.3f}")
         print(f"{side:8}{12 * side**2 / 2**20:10.1f}" + "".join(cells))
     if options.json:
-        options.json.write_text(json.dumps({"device": device.facts.as_dict(), "seconds": table}, indent=1) + "\n")
+        found = {"device": device.facts.as_dict(), "seconds": table}
+        options.json.write_text(json.dumps(found, indent=1) + "\n")
     if options.plot:
         draw(table, str(device.facts), device.facts.cache_bytes, options.plot)
 

@@ -19,7 +19,21 @@ _ADD = "__kernel void add(__global int *values) { values[get_global_id(0)] += 1;
 
 def facts(index: int, name: str, platform: str, kind: str, *, simulated: bool = False) -> DeviceFacts:
     return DeviceFacts(
-        index, name, platform, kind, "OpenCL 3.0", "1", True, 2, 32768, 1 << 30, 1 << 28, 256, 64, simulated
+        index,
+        name,
+        platform,
+        kind,
+        "OpenCL 3.0",
+        "1",
+        True,
+        2,
+        32768,
+        1 << 30,
+        1 << 28,
+        256,
+        64,
+        0,
+        simulated,
     )
 
 
