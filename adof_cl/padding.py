@@ -19,8 +19,8 @@ LARGEST_PADDED_SIDE = 16384
 def good_size(at_least: int) -> int:
     """Return the length to transform for `at_least` samples: a product of 2, 3, 5 and 7.
 
-    That length itself if it is one. Else the next, or one up to a sixteenth longer whose passes cost less: 512
-    samples are transformed sooner than 500.
+    That length itself if it is one. Else the next, or one up to a sixteenth longer whose passes cost less:
+    512 samples are transformed sooner than 500.
     """
     longest = at_least + at_least // 16
     found = [n for n in range(max(1, at_least), longest + 1) if _is_product(n)]
