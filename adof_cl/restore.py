@@ -64,7 +64,7 @@ class _Filter:
     """A slot: a filter formed as it is applied, from two axes and one level of noise, or a stored one."""
 
     formed: bool = False
-    nsr: float = 0.0
+    noise: np.generic | None = None
     long_axis: DeviceArray | None = None
     short_axis: DeviceArray | None = None
     stored: DeviceArray | None = None
@@ -282,6 +282,8 @@ class Restore:
         )
         # What the transforms leave undone: 1/2 of two that share one, and 1/n of each axis.
         self._scale = (1.0 if self.spectrum_dtype == np.float16 else 0.5 / outer.length) / inner.length
+        self._lift = 2.0 ** (300 if self._real == np.float64 else 40)  # both factors of H are lifted, so H is
+        self._lifted_scale = self._real.type(self._lift * self._scale)
         self._filter_shape = (cut.shorts // cut.block, inner.length, 2, cut.block)
         self._shorts, self._longs = cut.shorts, inner.length
         self._filters: dict[int, _Filter] = {}
@@ -386,7 +388,7 @@ class Restore:
         if kept.long_axis is None or kept.short_axis is None:
             kept.long_axis = self.device.empty((self._longs, 2), self._real)
             kept.short_axis = self.device.empty((self._shorts, 2), self._real)
-        kept.formed, kept.nsr = True, level
+        kept.formed, kept.noise = True, self._real.type(self._lift * self._lift * level)
         self._pair.update(
             {0: table, 1: table, 4: kept.long_axis, 5: kept.short_axis, 8: rows_from, 9: cols_from}
         )
@@ -508,10 +510,10 @@ class Restore:
         kept = self._filters[slot]
         self._middle.set(1, filtered)
         if kept.formed:
-            lift = 2.0 ** (300 if self._real == np.float64 else 40)
-            noise, scale = self._real.type(lift * lift * kept.nsr), self._real.type(lift * self._scale)
             self._middle.update({2: None, 3: kept.long_axis, 4: kept.short_axis})
-            self._middle.update({self._noise_argument: noise, self._noise_argument + 1: scale})
+            self._middle.update(
+                {self._noise_argument: kept.noise, self._noise_argument + 1: self._lifted_scale}
+            )
         else:
             self._middle.set(2, kept.stored)
         self._middle()
