@@ -215,7 +215,7 @@ class DeviceArray:
         return self
 
     def stage(self, values: NDArray[Any]) -> None:
-        """Take a copy of `values` (same shape and dtype), for `send`; waits for no kernel. The last one counts.
+        """Take a copy of `values` (same shape and dtype) for `send`; waits for no kernel. The last counts.
 
         Where copies have a queue of their own this one starts now: nothing enqueued may still use the array.
         """

@@ -99,8 +99,8 @@ def main() -> int:
     for done, memory, seconds in points[:: max(len(points) // 20, 1)]:
         print(f"{done:9d} frames  {memory / 1e6:8.3f} MB  {seconds:7.1f} s")
     print(
-        f"{options.frames} frames of {columns} x {rows} on {device.facts}: {grown / 1e6:+.3f} MB after the first "
-        f"{warm}, {options.frames / points[-1][2]:.0f} frames a second"
+        f"{options.frames} frames of {columns} x {rows} on {device.facts}: {grown / 1e6:+.3f} MB after the "
+        f"first {warm}, {options.frames / points[-1][2]:.0f} frames a second"
     )
     if options.json:
         options.json.write_text(json.dumps({"device": device.facts.as_dict(), "points": points}, indent=1))
