@@ -64,17 +64,17 @@ def shots(frame: np.ndarray, count: int) -> Iterator[Shot]:
         yield Shot(frame, {"peg": steady, "hole": Blur(1.0, 0.02 * (k % 17))}, places)
 
 
-def curve(device: Device, shape: tuple[int, int], frames: int, every: int) -> list[tuple[int, int, float]]:
-    """Return (frames so far, resident bytes, seconds) every so many frames."""
+def curve(
+    device: Device, shape: tuple[int, int], frames: int, every: int
+) -> Iterator[tuple[int, int, float]]:
+    """Yield (frames so far, resident bytes, seconds) every so many frames."""
     pipeline, frame = chain(device, shape)
-    points: list[tuple[int, int, float]] = []
     began = time.perf_counter()
     for result in Stream(pipeline).run(shots(frame, frames)):
         done = result.numbers[0] + 1
         if done % every == 0:
             gc.collect()
-            points.append((done, resident_bytes(), time.perf_counter() - began))
-    return points
+            yield done, resident_bytes(), time.perf_counter() - began
 
 
 def growth(points: list[tuple[int, int, float]], warm: int) -> int:
@@ -88,16 +88,20 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=200_000)
     parser.add_argument("--shape", default="128x96", help="columns x rows")
     parser.add_argument("--device", default=None)
+    parser.add_argument("--copies-apart", action="store_true", help="copies on queues of their own")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--png", type=Path)
     options = parser.parse_args()
     columns, rows = (int(n) for n in options.shape.split("x"))
     every, warm = max(options.frames // 100, 1), options.frames // 20
-    device = Device.open(options.device)
-    points = curve(device, (rows, columns), options.frames, every)
+    device = Device.open(options.device, copies_apart=options.copies_apart or None)
+    points = []
+    for point in curve(device, (rows, columns), options.frames, every):
+        points.append(point)
+        done, memory, seconds = point
+        if len(points) % 5 == 0:
+            print(f"{done:9d} frames  {memory / 1e6:8.3f} MB  {seconds:7.1f} s", flush=True)
     grown = growth(points, warm)
-    for done, memory, seconds in points[:: max(len(points) // 20, 1)]:
-        print(f"{done:9d} frames  {memory / 1e6:8.3f} MB  {seconds:7.1f} s")
     print(
         f"{options.frames} frames of {columns} x {rows} on {device.facts}: {grown / 1e6:+.3f} MB after the "
         f"first {warm}, {options.frames / points[-1][2]:.0f} frames a second"
@@ -119,7 +123,13 @@ def _plot(points: list[tuple[int, int, float]], warm: int, path: Path) -> None:
     figure, axes = plt.subplots(figsize=(7, 3), layout="constrained")
     axes.plot(done, memory / 1e6, color="black")
     axes.axvspan(0, warm, color="0.9")
-    axes.set(xlabel="frames", ylabel="resident memory, MB", xlim=(0, done[-1]))
+    level = memory[-1] / 1e6
+    axes.set(
+        xlabel="frames",
+        ylabel="resident memory, MB",
+        xlim=(0, done[-1]),
+        ylim=(min(memory.min() / 1e6, level - 1) - 0.1, max(memory.max() / 1e6, level + 1) + 0.1),
+    )
     figure.savefig(path, dpi=120)
     plt.close(figure)
 
