@@ -184,7 +184,7 @@ class DeviceArray:
 
     `shape` and `dtype` are NumPy's. `upload` and `download` keep their place among the kernels of the queue.
     For streams, where copies hide behind kernels, the same comes in two halves: `stage` and `send`,
-    `begin_download` and `download`. Their place in host memory is made at the first use and kept.
+    `begin_download` and `download`.
     """
 
     def __init__(self, device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> None:
@@ -202,8 +202,8 @@ class DeviceArray:
         device.made(self.buffer)
         self._leaving: NDArray[Any] | None = None  # on the host, as long as the array lives
         self._left: cl.Event | None = None
-        self._arriving: NDArray[Any] | None = None
-        self._arrival: cl.Event | None = None
+        self._pinned: NDArray[Any] | None = None
+        self._arrival: tuple[cl.Event, NDArray[Any]] | None = None
 
     def upload(self, values: NDArray[Any]) -> DeviceArray:
         """Copy `values` (same shape and dtype) to the device; returns when the host may reuse them."""
@@ -246,39 +246,40 @@ class DeviceArray:
 
         Until it is downloaded nothing may be enqueued that writes the array.
         """
-        if self._arriving is None:
-            self._arriving = self.device.host_array(self.shape, self.dtype)
-        computed = None
+        host, computed = np.empty(self.shape, self.dtype), None
         if self.device.copies_apart:
-            computed = [cl.enqueue_marker(self.device.queue)]
+            if self._pinned is None:
+                self._pinned = self.device.host_array(self.shape, self.dtype)
+            host, computed = self._pinned, [cl.enqueue_marker(self.device.queue)]
             self.device.queue.flush()
         queue = self.device.download_queue
-        self._arrival = cl.enqueue_copy(
-            queue, self._arriving, self.buffer, is_blocking=False, wait_for=computed
-        )
+        self._arrival = cl.enqueue_copy(queue, host, self.buffer, is_blocking=False, wait_for=computed), host
         queue.flush()
 
     @property
     def arrived(self) -> bool:
         """Whether `download` would return at once what `begin_download` began to copy."""
         done = cl.command_execution_status.COMPLETE
-        return self._arrival is not None and self._arrival.command_execution_status <= done
+        return self._arrival is not None and self._arrival[0].command_execution_status <= done
 
     def download(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
         """Copy to the host, after everything enqueued before; into `out` if given (same shape, dtype)."""
-        if out is None:
-            out = np.empty(self.shape, self.dtype)
-        elif out.shape != self.shape or out.dtype != self.dtype or not out.flags.c_contiguous:
+        if out is not None and (
+            out.shape != self.shape or out.dtype != self.dtype or not out.flags.c_contiguous
+        ):
             raise InputError(
                 f"out is {out.shape} {out.dtype}, a C-ordered {self.shape} {self.dtype} was wanted: "
                 "allocate it like the device array"
             )
-        if self._arrival is None or self._arriving is None:
+        if self._arrival is None:
+            out = np.empty(self.shape, self.dtype) if out is None else out
             cl.enqueue_copy(self.device.queue, out, self.buffer, is_blocking=True)
             return out
-        arrival, self._arrival = self._arrival, None
-        arrival.wait()
-        np.copyto(out, self._arriving)
+        (event, host), self._arrival = self._arrival, None
+        event.wait()
+        if out is None:
+            return host.copy() if self.device.copies_apart else host
+        np.copyto(out, host)
         return out
 
     def require_alike(self, values: NDArray[Any]) -> None:
