@@ -202,7 +202,7 @@ class DeviceArray:
         device.made(self.buffer)
         self._leaving: NDArray[Any] | None = None  # on the host, as long as the array lives
         self._left: cl.Event | None = None
-        self._pinned: NDArray[Any] | None = None
+        self._host: NDArray[Any] | None = None
         self._arrival: tuple[cl.Event, NDArray[Any]] | None = None
 
     def upload(self, values: NDArray[Any]) -> DeviceArray:
@@ -246,11 +246,12 @@ class DeviceArray:
 
         Until it is downloaded nothing may be enqueued that writes the array.
         """
-        host, computed = np.empty(self.shape, self.dtype), None
+        host, self._host = self._host, None
+        if host is None:
+            host = self.device.host_array(self.shape, self.dtype)
+        computed = None
         if self.device.copies_apart:
-            if self._pinned is None:
-                self._pinned = self.device.host_array(self.shape, self.dtype)
-            host, computed = self._pinned, [cl.enqueue_marker(self.device.queue)]
+            computed = [cl.enqueue_marker(self.device.queue)]
             self.device.queue.flush()
         queue = self.device.download_queue
         self._arrival = cl.enqueue_copy(queue, host, self.buffer, is_blocking=False, wait_for=computed), host
@@ -277,8 +278,11 @@ class DeviceArray:
             return out
         (event, host), self._arrival = self._arrival, None
         event.wait()
+        if out is None and not self.device.copies_apart:
+            return host  # the caller's own from now on
+        self._host = host
         if out is None:
-            return host.copy() if self.device.copies_apart else host
+            return host.copy()
         np.copyto(out, host)
         return out
 
