@@ -312,7 +312,7 @@ class SsdSearch:
         return inside
 
     def __call__(self, image: DeviceArray) -> None:
-        """Enqueue one search of `image` (`image_shape`, `dtype`); fetch the result afterwards.
+        """Enqueue one search of `image` (`image_shape`, `dtype`); fetch the result before the next.
 
         Raises
         ------
@@ -336,6 +336,12 @@ class SsdSearch:
         self._search()
         if self._best:
             self._best()
+        self._records.begin_download()
+
+    @property
+    def found(self) -> bool:
+        """Whether `fetch` would return at once."""
+        return self._records.arrived
 
     def fetch(self) -> SearchResult:
         """Wait for the last search and return what it found."""
