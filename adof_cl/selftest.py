@@ -393,6 +393,12 @@ def check_restore(device: Device, size: Size, precision: str) -> Iterator[Outcom
                 )
 
 
+_RESTORE_KERNELS = {
+    "lanes": ("restore_frame",),
+    "groups": ("restore_rows_forward", "restore_columns", "restore_rows_inverse"),
+}
+
+
 def _restored(plan: Restore, name: str, precision: str) -> Outcome:
     rng = np.random.default_rng(6)
     kind = plan.in_dtype
@@ -426,11 +432,9 @@ def _restored(plan: Restore, name: str, precision: str) -> Outcome:
             error, bound = max(error, _relative(found, wanted)), limit
             if kind.name != precision:  # stored in float32 after float64 arithmetic
                 bound = _eps("float32") / 2
-    outer, inner = ("columns", "rows") if plan.family == "lanes" else ("rows", "columns")
-    kernels = (f"restore_{outer}_forward", f"restore_{inner}", f"restore_{outer}_inverse")
     return Outcome(
         name,
-        (*kernels, "wiener_axes", "wiener_pair", "wiener_arrange"),
+        (*_RESTORE_KERNELS[plan.family], "wiener_axes", "wiener_pair", "wiener_arrange"),
         "levels" if kind.kind == "u" else "relative L2",
         error,
         bound,

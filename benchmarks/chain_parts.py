@@ -39,6 +39,9 @@ def main() -> None:
     search.set_windows(rng.integers(0, np.subtract(shape, 64), (4, 2)))
     there, image = device.empty(shape, np.uint8), device.empty(shape, np.uint8)
 
+    device.events = []
+    search(image)
+    searches = len(device.events)
     parts: dict[str, list[float]] = {"upload": [], "places down": [], "whole": []}
     for turn in range(options.frames + 10):
         device.wait()
@@ -56,7 +59,11 @@ def main() -> None:
         parts["upload"].append(uploaded - start)
         parts["places down"].append(fetched - finished)
         parts["whole"].append(fetched - start)
-        names = ("restore 1", "restore 2", "restore 3", *(f"search {k}" for k in range(1, 9)))
+        restores = len(device.events) - searches
+        names = (
+            *(f"restore {k}" for k in range(1, restores + 1)),
+            *(f"search {k}" for k in range(1, searches + 1)),
+        )
         for name, event in zip(names, device.events, strict=False):
             parts.setdefault(name, []).append(1e-9 * (event.profile.end - event.profile.start))
     medians = {name: 1e6 * float(np.median(values)) for name, values in parts.items()}

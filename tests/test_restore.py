@@ -99,6 +99,24 @@ def test_a_spectrum_in_halves_stays_within_three_of_255_grey_levels(
     assert relative_l2(found, wanted) <= 3e-3
 
 
+@pytest.mark.parametrize("other", [{"kind": "gpu"}, {"compute_units": 1}, {"compute_units": 7}], ids=str)
+def test_an_image_does_not_depend_on_which_work_items_take_its_tasks(
+    device: Device, other: dict[str, Any]
+) -> None:
+    """A launch a step; one work-item; more than there are cores: bit for bit the same, every time."""
+    plan = plan_of(device, "lanes")
+    opened = copy.copy(device)
+    opened.facts = replace(device.facts, **other)
+    second = Restore(opened, SHAPE, family="lanes", padding=PADDING)
+    frames = [random_frame(SHAPE, seed) for seed in range(4)]
+    for each in (plan, second):
+        each.set_filter_axes(*cubic_axes(each.padded_shape), 0.02)
+    wanted = [plan.restore(frame) for frame in frames]
+    for turn in range(200):
+        for each in (plan, second):
+            np.testing.assert_array_equal(each.restore(frames[turn % 4]), wanted[turn % 4])
+
+
 def test_an_image_larger_than_the_caches_is_streamed_and_the_same(device: Device) -> None:
     shape = (40, 4 * 64)
     results = []
