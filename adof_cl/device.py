@@ -1,4 +1,4 @@
-"""Choose and open one OpenCL device; its facts; arrays on it; waiting.
+"""Choose and open one OpenCL device; its facts; arrays on it, and copies that hide behind kernels; waiting.
 
 `pyopencl` enters the package here and in `program`, nowhere else.
 """
@@ -179,10 +179,16 @@ def choose(devices: Sequence[DeviceFacts], selector: str | None = None) -> Devic
     raise DeviceError(f"{asked}: choose an index, a type or a part of a name from [{listing}]")
 
 
+# Copying so little twice costs less than one wait for the queue.
+_SMALL_BYTES = 1 << 14
+
+
 class DeviceArray:
     """A C-ordered array in the device's memory.
 
-    `shape` and `dtype` are NumPy's. Copies to and from the host go through the device's one in-order queue.
+    `shape` and `dtype` are NumPy's. `upload` and `download` keep their place among the kernels of the queue.
+    For streams, where copies hide behind kernels, the same comes in two halves: `stage` and `send`,
+    `begin_download` and `download`.
     """
 
     def __init__(self, device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> None:
@@ -196,60 +202,203 @@ class DeviceArray:
                 f"an array of {self.nbytes} bytes was asked for, {device.facts} allocates at most "
                 f"{device.facts.max_allocation_bytes}: use a smaller frame or another device"
             )
-        self.buffer = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 1))
-        device.made(self.buffer)
+        self.buffer = self._allocated()
+        self._leaving: NDArray[Any] | None = None  # on the host, as long as the array lives
+        self._left: cl.Event | None = None
+        self._host: NDArray[Any] | None = None
+        self._arrival: tuple[cl.Event, NDArray[Any]] | None = None
 
     def upload(self, values: NDArray[Any]) -> DeviceArray:
         """Copy `values` (same shape and dtype) to the device; returns when the host may reuse them."""
+        self.require_alike(values)
+        if self.nbytes <= _SMALL_BYTES:
+            self._leave(self.device.queue, self._put(values))
+        else:
+            cl.enqueue_copy(self.device.queue, self.buffer, np.ascontiguousarray(values), is_blocking=True)
+        return self
+
+    def stage(self, values: NDArray[Any]) -> None:
+        """Take a copy of `values` (same shape and dtype) for `send`; waits for no kernel. The last counts.
+
+        Where copies have a queue of their own this one starts now: nothing enqueued may still use the array.
+        """
+        self.require_alike(values)
+        staged = self._put(values)
+        if self.device.copies_apart:
+            self._leave(self.device.upload_queue, staged)
+            self.device.upload_queue.flush()
+
+    def send(self) -> DeviceArray:
+        """Enqueue the arrival of what was staged; does not wait.
+
+        Raises
+        ------
+        InputError
+            Nothing was ever staged.
+        """
+        if self._leaving is None:
+            raise InputError("nothing was staged: call stage with the values first")
+        if self.device.copies_apart and self._left is not None:
+            cl.enqueue_barrier(self.device.queue, wait_for=[self._left])
+        else:
+            self._leave(self.device.queue, self._leaving)
+        return self
+
+    def begin_download(self) -> None:
+        """Start the copy that the next `download` returns, after everything enqueued before.
+
+        Until it is downloaded nothing may be enqueued that writes the array.
+        """
+        host, self._host = self._host, None
+        if host is None:
+            host = self.device.host_array(self.shape, self.dtype)
+        computed = None
+        if self.device.copies_apart:
+            computed = [cl.enqueue_marker(self.device.queue)]
+            self.device.queue.flush()
+        queue = self.device.download_queue
+        self._arrival = cl.enqueue_copy(queue, host, self.buffer, is_blocking=False, wait_for=computed), host
+        queue.flush()
+
+    @property
+    def arrived(self) -> bool:
+        """Whether `download` would return at once what `begin_download` began to copy."""
+        done = cl.command_execution_status.COMPLETE
+        return self._arrival is not None and self._arrival[0].command_execution_status <= done
+
+    def download(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Copy to the host, after everything enqueued before; into `out` if given (same shape, dtype)."""
+        self._require_room(out)
+        if self._arrival is None:
+            out = np.empty(self.shape, self.dtype) if out is None else out
+            cl.enqueue_copy(self.device.queue, out, self.buffer, is_blocking=True)
+            return out
+        (event, host), self._arrival = self._arrival, None
+        event.wait()
+        if out is None and not self.device.copies_apart:
+            return host  # the caller's own from now on
+        self._host = host
+        if out is None:
+            return host.copy()
+        np.copyto(out, host)
+        return out
+
+    def require_alike(self, values: NDArray[Any]) -> None:
+        """Refuse, with InputError, what is not of this array's shape and dtype."""
         if values.shape != self.shape or values.dtype != self.dtype:
             raise InputError(
                 f"an array of shape {values.shape} and type {values.dtype} came, {self.shape} and "
                 f"{self.dtype} was wanted: convert it first"
             )
-        cl.enqueue_copy(self.device.queue, self.buffer, np.ascontiguousarray(values), is_blocking=True)
-        return self
 
-    def download(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Copy to the host, after everything enqueued before; into `out` if given (same shape, dtype)."""
-        if out is None:
-            out = np.empty(self.shape, self.dtype)
-        elif out.shape != self.shape or out.dtype != self.dtype or not out.flags.c_contiguous:
+    def _require_room(self, out: NDArray[Any] | None) -> None:
+        if out is not None and (
+            out.shape != self.shape or out.dtype != self.dtype or not out.flags.c_contiguous
+        ):
             raise InputError(
                 f"out is {out.shape} {out.dtype}, a C-ordered {self.shape} {self.dtype} was wanted: "
                 "allocate it like the device array"
             )
-        cl.enqueue_copy(self.device.queue, out, self.buffer, is_blocking=True)
+
+    def _allocated(self) -> Any:
+        buffer = cl.Buffer(self.device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 1))
+        self.device.made(buffer)
+        return buffer
+
+    def _put(self, values: NDArray[Any]) -> NDArray[Any]:
+        if self._leaving is None:
+            self._leaving = self.device.host_array(self.shape, self.dtype)
+        if self._left is not None:
+            self._left.wait()  # the copy before still reads from there
+        np.copyto(self._leaving, values)
+        return self._leaving
+
+    def _leave(self, queue: cl.CommandQueue, values: NDArray[Any]) -> None:
+        self._left = cl.enqueue_copy(queue, self.buffer, values, is_blocking=False)
+
+
+class SharedArray(DeviceArray):
+    """An array in memory that a CPU's kernels share with the host: a download is a wait and no command more.
+
+    Some runtimes wake a worker anew for such a command, which takes longer than a small kernel.
+    """
+
+    def upload(self, values: NDArray[Any]) -> DeviceArray:
+        """Write `values` (same shape and dtype) once everything enqueued before is done."""
+        self.require_alike(values)
+        self.device.queue.finish()
+        np.copyto(self._shared, values)
+        return self
+
+    def begin_download(self) -> None:
+        """Mark what the next `download` waits for: everything enqueued before."""
+        self._arrival = cl.enqueue_marker(self.device.queue), self._shared
+        self.device.queue.flush()
+
+    def download(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Copy to the host's own memory, after everything enqueued before; into `out` if given."""
+        self._require_room(out)
+        if self._arrival is None:
+            self.device.queue.finish()
+        else:
+            self._arrival[0].wait()
+            self._arrival = None
+        if out is None:
+            return self._shared.copy()
+        np.copyto(out, self._shared)
         return out
+
+    def _allocated(self) -> Any:
+        self._shared: NDArray[Any] = cl.fsvm_empty(self.device.context, self.shape, self.dtype)
+        return cl.SVM(self._shared)
 
 
 class Device:
-    """One opened OpenCL device: a context and one in-order queue.
+    """One opened OpenCL device: a context and one in-order queue of kernels.
 
     Make it with `Device.open()`. Plans take it, keep it, and enqueue on its queue.
 
     Attributes
     ----------
+    copies_apart
+        Whether a stream's copies go through queues of their own, beside the kernels, from and to pinned host
+        memory. By default everywhere but on a CPU, which copies with the cores that compute.
     events
         None, or a list to which every launch adds its event: set one on a profiling device to time kernels.
     vector_bytes
         What `program.vector_bytes` found, once it was asked.
     """
 
-    def __init__(self, facts: DeviceFacts, handle: cl.Device, *, profiling: bool = False) -> None:
+    def __init__(
+        self,
+        facts: DeviceFacts,
+        handle: cl.Device,
+        *,
+        profiling: bool = False,
+        copies_apart: bool | None = None,
+    ) -> None:
         self.facts = facts
         self.handle = handle
         self.events: list[cl.Event] | None = None
         self.vector_bytes: int | None = None
         self.context = cl.Context([handle])
         self._kept: list[cl.Buffer] = []
+        self._shares_memory = facts.kind == "cpu" and not facts.simulated and _shares_memory(handle)
         if profiling:
             properties = cl.command_queue_properties.PROFILING_ENABLE
             self.queue = cl.CommandQueue(self.context, handle, properties=properties)
         else:
             self.queue = cl.CommandQueue(self.context, handle)
+        self.copies_apart = facts.kind != "cpu" if copies_apart is None else copies_apart
+        # One for each direction: a download waits for its kernels, and the next upload must not wait with it.
+        self.upload_queue, self.download_queue = (
+            cl.CommandQueue(self.context, handle) if self.copies_apart else self.queue for _ in range(2)
+        )
 
     @classmethod
-    def open(cls, selector: str | None = None, *, profiling: bool = False) -> Device:
+    def open(
+        cls, selector: str | None = None, *, profiling: bool = False, copies_apart: bool | None = None
+    ) -> Device:
         """Open the device `selector` names, else the one `ADOF_DEVICE` names, else the best real one.
 
         Raises
@@ -260,7 +409,7 @@ class Device:
         found = _found()
         facts = choose([f for f, _ in found], selector or os.environ.get(SELECTOR_VARIABLE))
         try:
-            return cls(facts, found[facts.index][1], profiling=profiling)
+            return cls(facts, found[facts.index][1], profiling=profiling, copies_apart=copies_apart)
         except cl.Error as failure:
             raise DeviceError(f"{facts} was found but could not be opened: {failure}") from failure
 
@@ -273,13 +422,31 @@ class Device:
         """Allocate an uninitialised array."""
         return DeviceArray(self, shape, dtype)
 
+    def shared(self, shape: tuple[int, ...], dtype: DTypeLike) -> DeviceArray:
+        """Allocate an uninitialised array for small results: where the device can, one that needs no copy."""
+        return SharedArray(self, shape, dtype) if self._shares_memory else self.empty(shape, dtype)
+
     def upload(self, values: NDArray[Any]) -> DeviceArray:
         """Allocate an array like `values` and copy them to it."""
         return DeviceArray(self, values.shape, values.dtype).upload(values)
 
+    def host_array(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        """Allocate an uninitialised array on the host; pinned where that lets copies run beside kernels."""
+        if not self.copies_apart:
+            return np.empty(shape, dtype)
+        flags = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
+        kind = np.dtype(dtype)
+        pinned = cl.Buffer(self.context, flags, max(int(np.prod(shape, dtype=np.int64)), 1) * kind.itemsize)
+        both: Any = cl.map_flags.READ | cl.map_flags.WRITE
+        mapped: Any = cl.enqueue_map_buffer(self.queue, pinned, both, 0, shape, kind, is_blocking=True)
+        array: NDArray[Any] = mapped[0]  # and mapped it stays for as long as it lives
+        return array
+
     def wait(self) -> None:
         """Return when everything enqueued so far is done."""
+        self.upload_queue.finish()
         self.queue.finish()
+        self.download_queue.finish()
 
     def real_type(self, precision: str) -> np.dtype[Any]:
         """Return the NumPy type of "float32" or "float64" arithmetic on this device.
@@ -296,3 +463,10 @@ class Device:
         if precision == "float64" and not self.facts.fp64:
             raise DeviceError(f"{self.facts} has no float64 arithmetic: use precision 'float32'")
         return np.dtype(precision)
+
+
+def _shares_memory(device: cl.Device) -> bool:
+    try:
+        return bool(int(device.svm_capabilities) & int(cl.device_svm_capabilities.FINE_GRAIN_BUFFER))
+    except cl.Error:  # OpenCL 1.2 knows no such memory
+        return False

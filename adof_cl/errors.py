@@ -29,5 +29,9 @@ class TrackingError(AdofError):
     """A feature cannot be followed: no texture, lost, or outside the frame."""
 
 
+class StreamError(AdofError):
+    """A frame under way in a stream failed, or the stream is closed; the message says which frame."""
+
+
 class LimitError(AdofError):
     """A move or a pattern lies beyond a limit; nothing was sent."""

@@ -44,12 +44,21 @@ def radices_of(n: int, registers: int = 0) -> tuple[int, ...]:
 
     Composite lengths get two passes at least: what is done to the first is not done to the last.
     """
-    costs = _COSTS[registers]
+    *others, last = _cheapest(n, registers)[1] or (1,)
+    return (*sorted(others, reverse=True), last) if n > 1 else ()
 
+
+def cost_of(n: int, registers: int) -> float:
+    """Return what the passes of `n` samples cost for each sample."""
+    return _cheapest(n, registers)[0]
+
+
+@cache
+def _cheapest(n: int, registers: int) -> tuple[float, tuple[int, ...]]:
     @cache
     def best(rest: int) -> tuple[float, tuple[int, ...]]:
         found: tuple[float, tuple[int, ...]] = (math.inf, ())
-        for radix, (turned, last) in costs.items():
+        for radix, (turned, last) in _COSTS[registers].items():
             if rest == radix and (rest < n or n in (2, 3, 5, 7)):
                 found = min(found, (last, (radix,)))
             elif rest % radix == 0 and rest > radix:
@@ -57,8 +66,7 @@ def radices_of(n: int, registers: int = 0) -> tuple[int, ...]:
                 found = min(found, (turned + cost, (radix, *tail)))
         return found
 
-    *others, last = best(n)[1] or (1,)
-    return (*sorted(others, reverse=True), last) if n > 1 else ()
+    return best(n) if n > 1 else (0.0, ())
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adof_cl.errors import InputError
+from adof_cl.fft_passes import cost_of
 
 SMALLEST_SIDE = 8
 LARGEST_SIDE = 4096
@@ -15,16 +17,25 @@ LARGEST_PADDED_SIDE = 16384
 
 
 def good_size(at_least: int) -> int:
-    """Return the smallest length from `at_least` on whose prime factors are 2, 3, 5 and 7."""
-    n = max(1, at_least)
-    while True:
-        rest = n
-        for prime in (2, 3, 5, 7):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return n
-        n += 1
+    """Return the length to transform for `at_least` samples: a product of 2, 3, 5 and 7.
+
+    That length itself if it is one. Else the next, or one up to a sixteenth longer whose passes cost less:
+    512 samples are transformed sooner than 500.
+    """
+    longest = at_least + at_least // 16
+    found = [n for n in range(max(1, at_least), longest + 1) if _is_product(n)]
+    if found and found[0] == max(1, at_least):
+        return found[0]
+    if not found:
+        found = [next(n for n in itertools.count(longest) if _is_product(n))]
+    return min(found, key=lambda n: n * cost_of(n, 16))
+
+
+def _is_product(n: int) -> bool:
+    for prime in (2, 3, 5, 7):
+        while n % prime == 0:
+            n //= prime
+    return n == 1
 
 
 def checked_frame_shape(shape: tuple[int, ...]) -> tuple[int, int]:

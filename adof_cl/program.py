@@ -105,10 +105,14 @@ class Launch:
         self._local_size = local_size
         self._arguments = list(arguments)  # holds the arrays, so that they outlive the launch
         for index, argument in enumerate(arguments):
-            self.set(index, argument)
+            self._pass(index, argument)
 
     def set(self, index: int, argument: Argument) -> None:
-        """Replace one argument from the next call on."""
+        """Replace one argument from the next call on; costs next to nothing where it is the same object."""
+        if argument is not self._arguments[index]:
+            self._pass(index, argument)
+
+    def _pass(self, index: int, argument: Argument) -> None:
         self._arguments[index] = argument
         if isinstance(argument, np.generic):
             # The public way tries everything else that a number could be first: 10 us instead of 0.1.

@@ -1,15 +1,17 @@
-"""Restore frames on the device: transform, filter, transform back, in three kernels.
+"""Restore frames on the device: transform, filter, transform back.
 
 One plan holds everything for one frame size: programs, tables, spectra, and as many filters as the caller
 keeps in slots. A call only enqueues. Two kernel families do the same arithmetic (docs/maths.md, section 4):
-*lanes* for CPUs, where a work-item owns one row or column per SIMD lane and nothing waits for anything, and
-*groups* for GPUs, where a work-group shares a pair of rows or a block of columns in local memory. Lanes
-transforms columns, rows, columns; groups rows, columns, rows: the outer axis twice, the inner one once.
+*lanes* for CPUs, where a work-item owns one row or column per SIMD lane and one launch does the three steps,
+and *groups* for GPUs, where a work-group shares a pair of rows or a block of columns in local memory and each
+step is a launch. Lanes transforms columns, rows, columns; groups rows, columns, rows: the outer axis twice,
+the inner one once.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,7 @@ from adof_cl.errors import InputError
 from adof_cl.fft_passes import Passes, pass_lists
 from adof_cl.noise import checked_nsr
 from adof_cl.padding import checked_frame_shape, padded_shape, padding_weights
-from adof_cl.program import Program, vector_bytes
+from adof_cl.program import Argument, Launch, Program, vector_bytes
 
 FAMILIES = ("lanes", "groups")
 
@@ -41,10 +43,10 @@ class _Cut:
     spectrum
         Shape of the spectrum, in reals.
     outer, outer_items, inner_items
-        Work-groups of the first and the last kernel, and work-items in each group; the middle one has a group
+        Tasks or work-groups of the outer steps, and work-items in each group; the middle one has a group
         for each block.
     outer_scratch, inner_scratch
-        Extra buffers a family's kernels take, in reals; 0: none is needed.
+        Extra buffers a family's steps take, in reals; 0: none is needed.
     """
 
     half_rows: bool
@@ -59,12 +61,59 @@ class _Cut:
     inner_scratch: tuple[int, ...] = ()
 
 
+_NUMBERS = tuple(np.int32(step) for step in range(4))  # the same objects: a launch sees that nothing changed
+
+
+class _Steps:
+    """The three steps of a frame: a launch each, or one launch told which of them to do.
+
+    Parameters
+    ----------
+    places
+        By name, the launches that take an argument, and at which index.
+    launches
+        Three, one a step; or one for all.
+    told
+        Where the one launch is told its first step and the one after its last.
+    apart
+        Whether the one launch is made anew for each step: where work-items cannot wait for each other.
+    """
+
+    def __init__(
+        self,
+        places: dict[str, list[tuple[Launch, int]]],
+        *launches: Launch,
+        told: tuple[int, int] = (0, 0),
+        apart: bool = True,
+    ) -> None:
+        self._places = places
+        self._launches = launches
+        self._told = told
+        self._apart = apart
+
+    def set(self, **values: Argument) -> None:
+        for name, value in values.items():
+            for launch, index in self._places[name]:
+                launch.set(index, value)
+
+    def run(self, first: int, end: int) -> None:
+        if len(self._launches) > 1:
+            for launch in self._launches[first:end]:
+                launch()
+            return
+        (launch,) = self._launches
+        edges = (*range(first, end), end) if self._apart else (first, end)
+        for start, stop in pairwise(edges):
+            launch.update(dict(zip(self._told, (_NUMBERS[start], _NUMBERS[stop]), strict=True)))
+            launch()
+
+
 @dataclass
 class _Filter:
     """A slot: a filter formed as it is applied, from two axes and one level of noise, or a stored one."""
 
     formed: bool = False
-    nsr: float = 0.0
+    noise: np.generic | None = None
     long_axis: DeviceArray | None = None
     short_axis: DeviceArray | None = None
     stored: DeviceArray | None = None
@@ -75,7 +124,7 @@ def _lanes(
 ) -> _Cut:
     """Divide for SIMD lanes: two vectors of columns, or one of their frequencies, to a work-item.
 
-    `moved` is the memory the kernels go through, in caches; `line` the bytes of a row of the image.
+    `moved` is the memory a frame goes through, in caches; `line` the bytes of a row of the image.
     """
     lanes = vector // real_bytes
     strips, held = -(-shape[1] // (2 * lanes)), padded[0] // 2 + 1
@@ -124,7 +173,8 @@ def _groups(rows: int, padded: tuple[int, int], real_bytes: int, local_bytes: in
 class Restore:
     """Restore frames of one size: pad, transform, multiply by a filter, transform back, crop.
 
-    Built once: compiles and allocates. Called often: enqueues three kernels, allocates nothing, never waits.
+    Built once: compiles and allocates. Called often: enqueues one launch or three, allocates nothing, never
+    waits.
 
     Parameters
     ----------
@@ -139,12 +189,12 @@ class Restore:
         clamped on the way out.
     padding
         Samples to add at least to each axis, one number or (rows, columns): the support of the blur, which
-        must not reach across the wrap. The padded size is the next product of 2, 3, 5 and 7.
+        must not reach across the wrap. The padded size is a product of 2, 3, 5 and 7 (`good_size`).
     taper
         True: the padding passes smoothly from the far edge to the near one. False: it replicates them, half
         each, and steps in the middle.
     spectrum_dtype
-        What the spectrum is kept in between the kernels: the precision's own type, or float16 for uint8 and
+        What the spectrum is kept in between the steps: the precision's own type, or float16 for uint8 and
         uint16 frames in float32. Half the memory to move, relative L2 errors below 3e-3 instead of 5e-7, and
         at most three of 255 grey levels.
     family
@@ -213,11 +263,11 @@ class Restore:
             moved = pixel_bytes * self.shape[0] * self.shape[1] / max(facts.cache_bytes, 1)
             line = self.out_dtype.itemsize * self.shape[1]
             cut = _lanes(self.shape, self.padded_shape, real_bytes, vector, moved, line)
-            outer, inner, names = columns, rows, ("columns", "rows")
+            outer, inner = columns, rows
         else:
             local, most = facts.local_memory_bytes, facts.max_work_group_size
             cut = _groups(self.shape[0], self.padded_shape, real_bytes, local, most)
-            outer, inner, names = rows, columns, ("rows", "columns")
+            outer, inner = rows, columns
         program = Program(
             device,
             f"restore_{self.family}.cl",
@@ -252,24 +302,53 @@ class Restore:
         outer_blend, inner_blend = blends if cut.half_rows else blends[::-1]
         outer_turns, inner_turns = self._table(outer.turns()), self._table(inner.turns())
         i32, zero = np.int32, self._real.type(0)
-        outer_size, outer_group = (cut.outer * cut.outer_items,), (cut.outer_items,)
-        inner_size, inner_group = (cut.shorts // cut.block * cut.inner_items,), (cut.inner_items,)
-        outer_scratch = [self._scratch(n) for n in cut.outer_scratch]
-        inner_scratch = [self._scratch(n) for n in cut.inner_scratch]
-        self._first = program.launch(
-            f"restore_{names[0]}_forward", outer_size, outer_group,
-            None, self._spectrum, places, outer_turns, outer_blend, *outer_scratch,
-        )  # fmt: skip
-        self._middle = program.launch(
-            f"restore_{names[1]}", inner_size, inner_group,
-            self._spectrum, self._spectrum, None, None, None, inner_turns, inner_blend, *inner_scratch,
-            zero, zero,
-        )  # fmt: skip
-        self._noise_argument = 7 + len(inner_scratch)
-        self._last = program.launch(
-            f"restore_{names[0]}_inverse", outer_size, outer_group,
-            self._spectrum, None, places, outer_turns, *outer_scratch,
-        )  # fmt: skip
+        if self.family == "lanes":
+            workers = min(facts.compute_units, max(cut.outer, cut.shorts // cut.block))
+            tasks = device.upload(np.zeros(16 * (4 + 3 * workers), np.int32))
+            frame = program.launch(
+                "restore_frame", (workers,), (1,),
+                None, self._spectrum, self._spectrum, None, None, None, None, places, outer_turns,
+                outer_blend, inner_turns, inner_blend, tasks, i32(0), i32(3), zero, zero,
+            )  # fmt: skip
+            self._steps = _Steps(
+                {
+                    "frame": [(frame, 0)], "filtered": [(frame, 2)], "image": [(frame, 3)],
+                    "filter": [(frame, 4)], "long_axis": [(frame, 5)], "short_axis": [(frame, 6)],
+                    "noise": [(frame, 15)], "scale": [(frame, 16)],
+                },
+                frame,
+                told=(13, 14),
+                apart=facts.simulated or facts.kind != "cpu",
+            )  # fmt: skip
+        else:
+            outer_size, outer_group = (cut.outer * cut.outer_items,), (cut.outer_items,)
+            inner_size, inner_group = (cut.shorts // cut.block * cut.inner_items,), (cut.inner_items,)
+            outer_scratch = [self._scratch(n) for n in cut.outer_scratch]
+            inner_scratch = [self._scratch(n) for n in cut.inner_scratch]
+            first = program.launch(
+                "restore_rows_forward", outer_size, outer_group,
+                None, self._spectrum, places, outer_turns, outer_blend, *outer_scratch,
+            )  # fmt: skip
+            middle = program.launch(
+                "restore_columns", inner_size, inner_group,
+                self._spectrum, self._spectrum, None, None, None, inner_turns, inner_blend, *inner_scratch,
+                zero, zero,
+            )  # fmt: skip
+            last = program.launch(
+                "restore_rows_inverse", outer_size, outer_group,
+                self._spectrum, None, places, outer_turns, *outer_scratch,
+            )  # fmt: skip
+            after = 7 + len(inner_scratch)
+            self._steps = _Steps(
+                {
+                    "frame": [(first, 0)], "filtered": [(middle, 1), (last, 0)], "image": [(last, 1)],
+                    "filter": [(middle, 2)], "long_axis": [(middle, 3)], "short_axis": [(middle, 4)],
+                    "noise": [(middle, after)], "scale": [(middle, after + 1)],
+                },
+                first,
+                middle,
+                last,
+            )  # fmt: skip
 
         wiener = Program(
             device,
@@ -282,6 +361,8 @@ class Restore:
         )
         # What the transforms leave undone: 1/2 of two that share one, and 1/n of each axis.
         self._scale = (1.0 if self.spectrum_dtype == np.float16 else 0.5 / outer.length) / inner.length
+        self._lift = 2.0 ** (300 if self._real == np.float64 else 40)  # both factors of H are lifted, so H is
+        self._lifted_scale = self._real.type(self._lift * self._scale)
         self._filter_shape = (cut.shorts // cut.block, inner.length, 2, cut.block)
         self._shorts, self._longs = cut.shorts, inner.length
         self._filters: dict[int, _Filter] = {}
@@ -343,7 +424,7 @@ class Restore:
     ) -> None:
         """Set a separable filter from 1-D OTFs that are on the device already; enqueues one small kernel.
 
-        With one level of noise no filter is ever stored: the columns' kernel forms it in registers.
+        With one level of noise no filter is ever stored: the middle step forms it in registers.
 
         Parameters
         ----------
@@ -386,7 +467,7 @@ class Restore:
         if kept.long_axis is None or kept.short_axis is None:
             kept.long_axis = self.device.empty((self._longs, 2), self._real)
             kept.short_axis = self.device.empty((self._shorts, 2), self._real)
-        kept.formed, kept.nsr = True, level
+        kept.formed, kept.noise = True, self._real.type(self._lift * self._lift * level)
         self._pair.update(
             {0: table, 1: table, 4: kept.long_axis, 5: kept.short_axis, 8: rows_from, 9: cols_from}
         )
@@ -449,9 +530,12 @@ class Restore:
         """
         self._require_array("out", out, self.out_dtype)
         self._require_filter(slot)
-        self.transform(frame)
-        self._transformed = False  # the columns overwrite it
-        return self._finish(self._spectrum, out, slot)
+        self._require_array("frame", frame, self.in_dtype)
+        self._transformed = False  # the rows overwrite it
+        self._steps.set(frame=frame)
+        self._set_end(self._spectrum, out, slot)
+        self._steps.run(0, 3)
+        return out
 
     def transform(self, frame: DeviceArray) -> None:
         """Enqueue the first third alone, to `apply` several filters to one frame afterwards.
@@ -462,8 +546,8 @@ class Restore:
             Another shape or type.
         """
         self._require_array("frame", frame, self.in_dtype)
-        self._first.set(0, frame)
-        self._first()
+        self._steps.set(frame=frame)
+        self._steps.run(0, 1)
         self._transformed = True
 
     def apply(self, out: DeviceArray, slot: int = 0) -> DeviceArray:
@@ -480,7 +564,9 @@ class Restore:
             raise InputError("no frame has been transformed since the last restoration: call transform first")
         if self._filtered is None:
             self._filtered = self.device.empty(self._spectrum.shape, self._real)
-        return self._finish(self._filtered, out, slot)
+        self._set_end(self._filtered, out, slot)
+        self._steps.run(1, 3)
+        return out
 
     def restore(self, frame: NDArray[Any], slot: int = 0) -> NDArray[Any]:
         """Upload a frame, restore it, wait, and return the image.
@@ -504,21 +590,19 @@ class Restore:
 
     # ---- inside -------------------------------------------------------------------------------------------
 
-    def _finish(self, filtered: DeviceArray, out: DeviceArray, slot: int) -> DeviceArray:
+    def _set_end(self, filtered: DeviceArray, out: DeviceArray, slot: int) -> None:
         kept = self._filters[slot]
-        self._middle.set(1, filtered)
+        self._steps.set(filtered=filtered, image=out)
         if kept.formed:
-            lift = 2.0 ** (300 if self._real == np.float64 else 40)
-            noise, scale = self._real.type(lift * lift * kept.nsr), self._real.type(lift * self._scale)
-            self._middle.update({2: None, 3: kept.long_axis, 4: kept.short_axis})
-            self._middle.update({self._noise_argument: noise, self._noise_argument + 1: scale})
+            self._steps.set(
+                filter=None,
+                long_axis=kept.long_axis,
+                short_axis=kept.short_axis,
+                noise=kept.noise,
+                scale=self._lifted_scale,
+            )
         else:
-            self._middle.set(2, kept.stored)
-        self._middle()
-        self._last.set(0, filtered)
-        self._last.set(1, out)
-        self._last()
-        return out
+            self._steps.set(filter=kept.stored)
 
     def _require_array(self, name: str, array: DeviceArray, dtype: np.dtype[Any]) -> None:
         if array.shape != self.shape or array.dtype != dtype:

@@ -402,6 +402,12 @@ def check_restore(device: Device, size: Size, precision: str) -> Iterator[Outcom
                 )
 
 
+_RESTORE_KERNELS = {
+    "lanes": ("restore_frame",),
+    "groups": ("restore_rows_forward", "restore_columns", "restore_rows_inverse"),
+}
+
+
 def _restored(plan: Restore, name: str, precision: str) -> Outcome:
     rng = np.random.default_rng(6)
     kind = plan.in_dtype
@@ -435,11 +441,9 @@ def _restored(plan: Restore, name: str, precision: str) -> Outcome:
             error, bound = max(error, _relative(found, wanted)), limit
             if kind.name != precision:  # stored in float32 after float64 arithmetic
                 bound = _eps("float32") / 2
-    outer, inner = ("columns", "rows") if plan.family == "lanes" else ("rows", "columns")
-    kernels = (f"restore_{outer}_forward", f"restore_{inner}", f"restore_{outer}_inverse")
     return Outcome(
         name,
-        (*kernels, "wiener_axes", "wiener_pair", "wiener_arrange"),
+        (*_RESTORE_KERNELS[plan.family], "wiener_axes", "wiener_pair", "wiener_arrange"),
         "levels" if kind.kind == "u" else "relative L2",
         error,
         bound,
@@ -485,7 +489,10 @@ def check_image_prep(device: Device, size: Size, precision: str) -> Iterator[Out
 def check_ssd_search(device: Device, size: Size, precision: str) -> Iterator[Outcome]:
     """Both families, every pixel type, both scores, three templates in windows of their own, patches too."""
     del precision  # scores are integers, or float32
-    template = (min(7, size[0] // 2), min(5, size[1] // 2))
+    template = (
+        size[0] // 2,
+        size[1] // 3 | 1,
+    )  # odd columns; at the full size more than one tile in lanes too
     search = (size[0] - 4, size[1] - 3)
     origins = np.array([(0, 0), (4, 3), (1, 2)])
     for family, dtype, score in itertools.product(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,19 +11,17 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError, TrackingError
-from adof_cl.program import Program, require_local_memory
+from adof_cl.program import Launch, Program, require_local_memory, vector_bytes
 
 LARGEST_TEMPLATE = 64
 """Longest side of a template: up to here uint8 sums are exact in every family (docs/maths.md, eq. S3)."""
 
 _IMAGE_KINDS = {np.dtype(np.uint8): 0, np.dtype(np.uint16): 1, np.dtype(np.float32): 2}
-# Sums a work-item of the lanes family holds in registers, as offset rows x vectors: 32 registers with vectors
-# of 16 floats, 16 with shorter ones.
-_LANE_BLOCKS = {
-    16: ((5, 3), (3, 5), (4, 4), (7, 2)),
-    8: ((5, 2), (3, 3), (9, 1)),
-    4: ((5, 2), (3, 3), (9, 1)),
-}
+# Offset rows x vectors that a work-item of the lanes family computes at once: their sums stay in registers.
+_BLOCKS = ((3, 3), (5, 2), (9, 1), (2, 3), (3, 2), (2, 2), (4, 1))
+# A work-item's tile of a window: below so many taps times offsets one tile costs less than a second launch,
+# and up to so many offsets, and so many in a row, its pixels and sums stay in the cache.
+_TILE_TAPS, _TILE_OFFSETS, _TILE_COLUMNS = 2**20, 4096, 128
 _GROUP_TILE = (16, 32)
 _GROUP_SIZE = (32, 4)
 _BEST_ITEMS = 64
@@ -117,33 +116,43 @@ class SsdSearch:
 
         rows, columns = self.template_shape
         self.offsets_shape = (self.search_shape[0] - rows + 1, self.search_shape[1] - columns + 1)
-        lanes = 0 if self.family == "groups" else _lanes(device)
-        block_rows, vectors = _lane_block(lanes, rows, self.offsets_shape) if lanes else (1, 1)
-        if lanes:
-            tile = (block_rows, vectors * lanes)
+        defines: dict[str, int]
+        if self.family == "lanes":
+            # Bytes are taken as shorts, and no vector of OpenCL C holds more than 16.
+            width = min(vector_bytes(device), 32) if self.dtype == np.uint8 else vector_bytes(device)
+            centred = score == "gain_offset" and self.dtype != np.uint8  # two sums an offset, and its mean
+            fitting = (4 if centred else 9) * (2 if width == 64 else 1)
+            block, tile = _lanes_tile(width // 4, fitting, self.template_shape, self.offsets_shape)
+            defines = {
+                "VECTOR_BYTES": width,
+                "BLOCK_ROWS": block[0],
+                "VECTORS": block[1],
+                "TILE_ROWS": tile[0],
+                "TILE_COLUMNS": tile[1],
+            }
         else:
-            tile = _GROUP_TILE
+            tile, defines = _GROUP_TILE, {"VECTOR_BYTES": 0}
             window = (tile[0] + rows - 1) * (tile[1] + columns - 1) * self.dtype.itemsize
             require_local_memory(
                 device, window + 8 * tile[0] * tile[1] // 4, f"a search for {rows} x {columns} templates"
             )
         tiles_y, tiles_x = (-(-n // t) for n, t in zip(self.offsets_shape, tile, strict=True))
+        map_columns = tiles_x * tile[1]
 
-        self._padding = block_rows - 1
-        self._padded = np.zeros((count, rows + 2 * self._padding, columns), np.float32)
+        self._values = np.zeros((count, rows, columns), np.float32)
         self._sums = np.zeros((count, 2), np.int32)
         self._origins = np.zeros((count, 2), np.int32)
-        self._ready = np.zeros(count, np.bool_)
+        self._missing = set(range(count))
         patch = 0
         if patch_margin is not None:
             self.patch_shape = (rows + 2 * patch_margin, columns + 2 * patch_margin)
             patch = self.patch_shape[0] * self.patch_shape[1]
-        self._templates_on_device = device.upload(self._padded)
+        self._templates_on_device = device.upload(self._values)
         self._sums_on_device = device.upload(self._sums)
         self._origins_on_device = device.upload(self._origins)
-        self._scores = device.empty((count, *self.offsets_shape), np.int32)
+        self._scores = device.empty((count, self.offsets_shape[0], map_columns), np.int32)
         tile_best = device.empty((count, tiles_y * tiles_x, 2), np.int32)
-        self._records = device.empty((count, 11 + patch), np.int32)
+        self._records = device.shared((count, 11 + patch), np.int32)
         self._fetched = np.empty(self._records.shape, np.int32)
         self._image: DeviceArray | None = None
 
@@ -155,44 +164,41 @@ class SsdSearch:
                 "GAIN_OFFSET": score == "gain_offset",
                 "TEMPLATE_ROWS": rows,
                 "TEMPLATE_COLUMNS": columns,
-                "LANES": lanes,
-                "BLOCK_ROWS": block_rows,
-                "VECTORS": vectors,
+                **defines,
                 "PATCH_MARGIN": -1 if patch_margin is None else patch_margin,
             },
         )
-        sizes = [np.int32(n) for n in (*self.image_shape, *self.offsets_shape)]
-        if lanes:
-            grid, group = (tiles_x, tiles_y, count), (1, 1, 1)
-            best_items = 1
-        else:
-            grid = (tiles_x * _GROUP_SIZE[0], tiles_y * _GROUP_SIZE[1], count)
-            group = (*_GROUP_SIZE, 1)
-            best_items = _BEST_ITEMS
+        sizes = [np.int32(n) for n in (*self.image_shape, *self.offsets_shape, map_columns)]
+        lanes = self.family == "lanes"
+        group = (1, 1) if lanes else _GROUP_SIZE
+        best_items = 1 if lanes else _BEST_ITEMS
         self._search = program.launch(
             "ssd_search",
-            grid,
-            group,
+            (tiles_x * group[0], tiles_y * group[1], count),
+            (*group, 1),
             None,
             self._templates_on_device,
             self._sums_on_device,
             self._origins_on_device,
             self._scores,
             tile_best,
-            *sizes,
-        )
-        self._best = program.launch(
-            "ssd_search_best",
-            (count * best_items,),
-            (best_items,),
-            None,
-            self._origins_on_device,
-            self._scores,
-            tile_best,
             self._records,
             *sizes,
-            np.int32(tiles_y * tiles_x),
         )
+        self._best: Launch | None = None
+        if not lanes or tiles_y * tiles_x > 1:
+            self._best = program.launch(
+                "ssd_search_best",
+                (count * best_items,),
+                (best_items,),
+                None,
+                self._origins_on_device,
+                self._scores,
+                tile_best,
+                self._records,
+                *sizes,
+                np.int32(tiles_y * tiles_x),
+            )
 
     def _check(self) -> None:
         if self.count < 1:
@@ -239,7 +245,7 @@ class SsdSearch:
             )
         for index, pixels in enumerate(templates):
             self._prepare(index, pixels)
-        self._templates_on_device.upload(self._padded)
+        self._templates_on_device.upload(self._values)
         self._sums_on_device.upload(self._sums)
 
     def set_template(self, index: int, pixels: NDArray[Any]) -> None:
@@ -252,7 +258,7 @@ class SsdSearch:
                 f"{self.dtype} was wanted: convert it first"
             )
         self._prepare(index, pixels)
-        self._templates_on_device.upload(self._padded)
+        self._templates_on_device.upload(self._values)
         self._sums_on_device.upload(self._sums)
 
     def _prepare(self, index: int, pixels: NDArray[Any]) -> None:
@@ -264,13 +270,12 @@ class SsdSearch:
                 f"template {index} is one grey level, {values.flat[0]:g}: choose one with texture"
             )
         if self.dtype == np.uint8:
-            values -= 128
             self._sums[index] = int(values.sum()), int((values * values).sum())
         elif self.score == "gain_offset":
             values -= values.mean()
             self._sums[index] = np.array([(values * values).sum(), 0], np.float32).view(np.int32)
-        self._padded[index, self._padding : self._padding + self.template_shape[0]] = values
-        self._ready[index] = True
+        self._values[index] = values
+        self._missing.discard(index)
 
     def set_windows(self, origins_yx: ArrayLike, *, clamp: bool = False) -> NDArray[np.int64]:
         """Place the windows; return their origins as used.
@@ -307,7 +312,7 @@ class SsdSearch:
         return inside
 
     def __call__(self, image: DeviceArray) -> None:
-        """Enqueue one search of `image` (`image_shape`, `dtype`); fetch the result afterwards.
+        """Enqueue one search of `image` (`image_shape`, `dtype`); fetch the result before the next.
 
         Raises
         ------
@@ -321,17 +326,25 @@ class SsdSearch:
                     f"{self.dtype} was wanted: build the search for this image"
                 )
             self._search.set(0, image)
-            self._best.set(0, image)
+            if self._best:
+                self._best.set(0, image)
             self._image = image
-        if not self._ready.all():
+        if self._missing:
             raise InputError(
-                f"template {int(self._ready.argmin())} was never set: call set_templates before the search"
+                f"template {min(self._missing)} was never set: call set_templates before the search"
             )
         self._search()
-        self._best()
+        if self._best:
+            self._best()
+        self._records.begin_download()
+
+    @property
+    def found(self) -> bool:
+        """Whether `fetch` would return at once."""
+        return self._records.arrived
 
     def fetch(self) -> SearchResult:
-        """Wait for the last search and return what it found, by one small download."""
+        """Wait for the last search and return what it found."""
         records = self._records.download(self._fetched)
         neighbourhood = self._decoded(records[:, 2:11]).reshape(self.count, 3, 3)
         patches = None
@@ -346,7 +359,7 @@ class SsdSearch:
 
     def score_maps(self) -> NDArray[np.float64]:
         """Wait for the last search and return every score, (count, rows, columns) of `offsets_shape`."""
-        return self._decoded(self._scores.download())
+        return self._decoded(self._scores.download()[:, :, : self.offsets_shape[1]])
 
     def search(self, image: NDArray[Any]) -> SearchResult:
         """Upload `image`, search it and return the result: the short way, when speed does not matter."""
@@ -360,24 +373,40 @@ class SsdSearch:
 
     def _decoded(self, bits: NDArray[np.int32]) -> NDArray[np.float64]:
         integers = self.dtype == np.uint8 and self.score == "ssd"
-        values = bits.astype(np.float64) if integers else np.ascontiguousarray(bits).view(np.float32)
-        return np.where(bits == _SCORE_NONE, np.inf, values.astype(np.float64))
+        values = (bits if integers else bits.view(np.float32)).astype(np.float64)
+        np.copyto(values, np.inf, where=bits == _SCORE_NONE)
+        return values
 
 
-def _lanes(device: Device) -> int:
-    floats = device.facts.vector_bytes // 4
-    return 16 if floats >= 16 else 8 if floats >= 8 else 4
+def _lanes_tile(
+    lanes: int, fitting: int, template: tuple[int, int], offsets: tuple[int, int]
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Choose the block, of at most `fitting` vectors, that wastes least, and how many offsets make a tile."""
+
+    def covered(block: tuple[int, int]) -> tuple[int, int]:
+        return _multiple(offsets[0], block[0]), _multiple(offsets[1], block[1] * lanes)
+
+    # A tap is loaded once for its block, a row of the window once for each of its vectors.
+    block = min(
+        (b for b in _BLOCKS if math.prod(b) <= fitting),
+        key=lambda b: math.prod(covered(b)) * (1 + 1 / b[0] + 1 / b[1]),
+    )
+    rows, columns = covered(block)
+    most = max(min(_TILE_TAPS // math.prod(template), _TILE_OFFSETS), math.prod(block) * lanes)
+    if rows * columns > most or columns > _TILE_COLUMNS:
+        columns = _share(columns, min(_TILE_COLUMNS, most // block[0]), block[1] * lanes)
+        rows = _share(rows, most // columns, block[0])
+    return block, (rows, columns)
 
 
-def _lane_block(lanes: int, template_rows: int, offsets: tuple[int, int]) -> tuple[int, int]:
-    """Choose the block that wastes least: sums beyond the offsets, and rows beyond the template."""
+def _multiple(n: int, unit: int) -> int:
+    return -(-n // unit) * unit
 
-    def cost(block: tuple[int, int]) -> float:
-        rows, vectors = block
-        tiles = -(-offsets[0] // rows) * -(-offsets[1] // (vectors * lanes))
-        return float(tiles * (template_rows + rows - 1) * (rows * vectors + vectors + rows / 2))
 
-    return min(_LANE_BLOCKS[lanes], key=cost)
+def _share(total: int, most: int, unit: int) -> int:
+    """Return the size of equal parts of `total`, the fewest of at most `most`, in whole units."""
+    parts = -(-total // max(most // unit * unit, unit))
+    return _multiple(-(-total // parts), unit)
 
 
 def _shape(name: str, shape: tuple[int, int]) -> tuple[int, int]:

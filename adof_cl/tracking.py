@@ -427,7 +427,7 @@ class TemplateTracker:
     """Follow k features through frames that lie on the device.
 
     Built once: compiles and allocates. Each frame: `aim` places the windows, `enqueue` searches without
-    waiting, `collect` waits and refines; `track` does all three.
+    waiting, `collect` waits for this search alone and refines; `track` does all three.
 
     Parameters
     ----------
@@ -525,12 +525,7 @@ class TemplateTracker:
             Another shape, or values that are not finite.
         """
         if feature_xy_px is not None:
-            places = np.array(feature_xy_px, dtype=np.float64)
-            if places.shape != self._aimed.shape or not np.isfinite(places).all():
-                raise InputError(
-                    f"feature_xy_px of shape {places.shape} came: {self._aimed.shape} finite pixels were "
-                    "wanted"
-                )
+            places = self.checked_places(feature_xy_px)
             self._last, self._placed = places, True
             self._step[:] = 0
             self._seen[:] = False
@@ -552,9 +547,23 @@ class TemplateTracker:
         corner = np.rint(np.clip(self._aimed[:, ::-1], -edge, edge) - self._anchors - slack).astype(np.int64)
         self.search.set_windows(corner, clamp=True)
 
+    def checked_places(self, feature_xy_px: ArrayLike) -> Array:
+        """Return a copy of expected places, (k, 2); InputError for another shape or what is not finite."""
+        places = np.array(feature_xy_px, dtype=np.float64)
+        if places.shape != self._aimed.shape or not np.isfinite(places).all():
+            raise InputError(
+                f"feature_xy_px of shape {places.shape} came: {self._aimed.shape} finite pixels were wanted"
+            )
+        return places
+
     def enqueue(self, image: DeviceArray) -> None:
         """Search one frame; does not wait."""
         self.search(image)
+
+    @property
+    def ready(self) -> bool:
+        """Whether `collect` would not have to wait."""
+        return self.search.found
 
     def collect(self) -> list[Measurement]:
         """Wait for the frame's search and return one measurement for each template."""

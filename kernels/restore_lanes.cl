@@ -3,12 +3,12 @@
 //   restored = IFFT2( FFT2( padded frame ) * filter )    docs/maths.md, eqs. W2 to W5
 //   filter   = conj(H) / (|H|^2 + nsr), H = h_row h_column, where it is not stored            eqs. W1 and W9
 //
-// Three kernels, no barriers: columns forward; rows forward, times filter, rows inverse; columns inverse. A
-// work-item owns LANES * 2 columns or the spectra of LANES rows, one to each SIMD lane: pixels are read and written
-// as they lie, and only the spectra change their lanes, once there and once back. The transforms run decimated in
-// frequency going forward and in time coming back, so that nothing is ever reordered: spectrum and filter are
-// addressed in digit-reversed order instead. What lies between the first pass forward and the last one back runs
-// to its end on one part of the first pass before the next part is touched, in the cache nearest to the core.
+// Three steps: columns forward; rows forward, times filter, rows inverse; columns inverse. A task is LANES * 2
+// columns or the spectra of LANES rows, one to each SIMD lane: pixels are read and written as they lie, and only
+// the spectra change their lanes, once there and once back. The transforms run decimated in frequency going forward
+// and in time coming back, so that nothing is ever reordered: spectrum and filter are addressed in digit-reversed
+// order instead. What lies between the first pass forward and the last one back runs to its end on one part of the
+// first pass before the next part is touched, in the cache nearest to the core.
 //
 //   frame     (ROWS, COLS) IN_TYPE              the image to restore
 //   image     (ROWS, COLS) OUT_TYPE             the restored image; integers are rounded and clamped
@@ -21,6 +21,8 @@
 //   position  (2, SLOTS) int                    where a slot's frequency k, and NY - k, lie after the passes
 //   row_blend (NX - COLS) real, column_blend (NY - ROWS) real   share of the near edge in the padding
 //   row_turns, column_turns   real              twiddle factors, pass by pass: cos and -sin, q = 1 .. R - 1
+//   tasks     (16 * (4 + 3 * work-items)) int   counters of the tasks, 0 before and after
+//   first, last               int               steps to do: 0 and 3 for all
 //   noise, scale              real              nsr and what the transforms leave undone, as wiener_pair wants
 //
 // A work-item's samples lie real, imaginary, real, .. : apart, the strides of a power of two would fill the
@@ -28,10 +30,13 @@
 //
 // Defines: VECTOR_BYTES; ROWS, COLS frame; NX, NY padded; STRIPS of columns; HELD frequencies of a column of the
 // frame, SLOTS that number in whole blocks of LANES; IN_TYPE, OUT_TYPE; OUT_LIMIT the largest code of an integer
-// output, 0 for a real one; STREAM_IMAGE: the caches cannot hold it and its strips are whole lines; HALF_SPECTRUM; STORED_LEVEL grey levels to a stored one, 1 but for half. The passes come
-// from the generated lists: ROW_FIRST, then ROW_MIDDLE and ROW_LAST in each part of ROW_INNER samples; likewise columns.
+// output, 0 for a real one; STREAM_IMAGE: the caches cannot hold it and its strips are whole lines; HALF_SPECTRUM;
+// STORED_LEVEL grey levels to a stored one, 1 but for half. The passes come from the generated lists: ROW_FIRST, then
+// ROW_MIDDLE and ROW_LAST in each part of ROW_INNER samples; likewise columns.
 //
-// Local size 1; no local memory. Private memory: two vectors for each sample of a row or column.
+// One work-item a processor core, each taking tasks until there are none; local size 1; no local memory, no barriers.
+// A launch of one step is safe on any device; of several where work-items of one launch see each other's global
+// writes after atomics, as they do on processors. Private memory: two vectors for each sample of a row or column.
 // Error: below 4e-7 (float) and 1e-15 (double), relative L2, 8 x 8 to 1024 x 1024, PoCL and Intel's runtime.
 
 #include "restore_transpose.h"
@@ -65,7 +70,7 @@ typedef vec stored;
 #endif
 
 // The next strips of a row lie far apart, where no processor looks ahead.
-#if __has_builtin(__builtin_prefetch)
+#if __has_builtin(__builtin_prefetch) && !PORTABLE
 #define PREFETCH(P) __builtin_prefetch(P)
 #else
 #define PREFETCH(P)
@@ -299,19 +304,17 @@ RESTORE_DEFINE_PASSES(15)
 #define ROW_FILTER(R, M, T)     restore_filter##R(part, length, block_filter + 2 * b);
 #define ROW_WIENER(R, M, T)     restore_wiener##R(part, length, long_axis + 2 * b, hr, hi, noise, scale);
 
-// ---- kernels ----------------------------------------------------------------------------------------------
+// ---- steps ------------------------------------------------------------------------------------------------
 
-// Work-item s transforms columns s * STRIP onward: the first LANES as real parts, the next as imaginary parts.
-__kernel WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
-restore_columns_forward(
-    __global const IN_TYPE *restrict frame,
-    __global stored        *restrict spectrum,
-    __global const int     *restrict position,
-    __global const real    *restrict column_turns,
-    __global const real    *restrict column_blend)
+// Calls: inlined into one kernel, the three keep a compiler busy for minutes.
+#define STEP static WIDE __attribute__((noinline))
+
+// Columns `strip` * STRIP onward to their spectra: the first LANES as real parts, the next as imaginary parts.
+STEP void restore_columns_forward(vec *work, const int strip, __global const IN_TYPE *frame,
+                                  __global stored *spectrum, __global const int *position,
+                                  __global const real *column_turns, __global const real *column_blend)
 {
-    vec work[2 * NY];
-    const int col = STRIP * get_global_id(0);
+    const int col = STRIP * strip;
 #if COLS % STRIP
     if (col + STRIP > COLS) {
         vec *part = work;
@@ -330,7 +333,7 @@ restore_columns_forward(
         COLUMN_LAST(COLUMN_FORWARD)
     }
     // Two real columns in one complex transform come apart by symmetry; the factor 1/2 is in the scale.
-    __global stored *out = spectrum + 4 * (size_t)SLOTS * get_global_id(0);
+    __global stored *out = spectrum + 4 * (size_t)SLOTS * strip;
     for (int i = 0; i < HELD; ++i) {
         const vec *p = work + 2 * position[i], *q = work + 2 * position[SLOTS + i];
         PUT(out, 4 * i, SCALED(p[0] + q[0]));
@@ -341,20 +344,14 @@ restore_columns_forward(
     for (int i = 4 * HELD; i < 4 * SLOTS; ++i) PUT(out, i, (vec)(0));
 }
 
-// Work-item b carries LANES vertical frequencies there and back; the columns of the padding are made here.
-__kernel WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
-restore_rows(
-    __global const stored *spectrum,
-    __global stored       *filtered,
-    __global const vec    *restrict filter,
-    __global const real   *restrict long_axis,
-    __global const vec    *restrict short_axis,
-    __global const real   *restrict row_turns,
-    __global const real   *restrict row_blend,
-    const real noise, const real scale)
+// LANES vertical frequencies there and back; the columns of the padding are made here.
+STEP void restore_rows(vec *work, const size_t block, __global const stored *spectrum,
+                       __global stored *filtered, __global const vec *filter,
+                       __global const real *long_axis, __global const vec *short_axis,
+                       __global const real *row_turns, __global const real *row_blend,
+                       const real noise, const real scale)
 {
-    vec work[2 * (STRIPS * STRIP > NX ? STRIPS * STRIP : NX)], r[LANES], i[LANES];
-    const size_t block = get_global_id(0);
+    vec r[LANES], i[LANES];
     for (int x = 0; x < STRIPS * STRIP; x += LANES) {
         __global const stored *in = spectrum + 4 * (x / STRIP * SLOTS + block * LANES) + x / LANES % 2 * 2;
         _Pragma("unroll")
@@ -416,17 +413,13 @@ restore_rows(
     }
 }
 
-// Work-item s puts columns s * STRIP onward together again: the same pairs, the same order, backwards.
-__kernel WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
-restore_columns_inverse(
-    __global const stored *restrict filtered,
-    __global OUT_TYPE     *restrict image,
-    __global const int    *restrict position,
-    __global const real   *restrict column_turns)
+// Columns `strip` * STRIP onward from their spectra: the same pairs, the same order, backwards.
+STEP void restore_columns_inverse(vec *work, const int strip, __global const stored *filtered,
+                                  __global OUT_TYPE *image, __global const int *position,
+                                  __global const real *column_turns)
 {
-    vec work[2 * NY];
-    const int col = STRIP * get_global_id(0);
-    __global const stored *in = filtered + 4 * (size_t)SLOTS * get_global_id(0);
+    const int col = STRIP * strip;
+    __global const stored *in = filtered + 4 * (size_t)SLOTS * strip;
     for (int i = 0; i < HELD; ++i) {
         vec *p = work + 2 * position[i], *q = work + 2 * position[SLOTS + i];
         const vec ar = GET(in, 4 * i), ai = GET(in, 4 * i + 1), br = GET(in, 4 * i + 2), bi = GET(in, 4 * i + 3);
@@ -452,4 +445,65 @@ restore_columns_inverse(
     {
         COLUMN_FIRST(COLUMN_UNLOAD)
     }
+}
+
+// ---- the kernel -------------------------------------------------------------------------------------------
+
+#define STEPS 3
+#define WORK  (2 * (STRIPS * STRIP > NX ? (STRIPS * STRIP > NY ? STRIPS * STRIP : NY) : (NX > NY ? NX : NY)))
+
+// Counters stand a cache line apart.
+#define TAKEN(STEP, OWNER) (tasks + 16 * (STEPS + 1 + (STEP) * (int)get_global_size(0) + (OWNER)))
+#define DONE(STEP)         (tasks + 16 * (STEP))
+#define GONE               (tasks + 16 * STEPS)
+
+// Steps `first` to `last` - 1. Each work-item does its share of a step's tasks, then takes of the others' shares;
+// it begins a step when all tasks of the one before are done. So it waits only for what another is doing at that
+// moment, never for one that has not begun: any number of them at a time, one by one too, come to the end.
+__kernel WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
+restore_frame(
+    __global const IN_TYPE *frame,
+    __global stored        *spectrum,
+    __global stored        *filtered,
+    __global OUT_TYPE      *image,
+    __global const vec     *filter,
+    __global const real    *long_axis,
+    __global const vec     *short_axis,
+    __global const int     *position,
+    __global const real    *column_turns,
+    __global const real    *column_blend,
+    __global const real    *row_turns,
+    __global const real    *row_blend,
+    __global int           *tasks,
+    const int first, const int last,
+    const real noise, const real scale)
+{
+    vec work[WORK];
+    const int workers = get_global_size(0), self = get_global_id(0);
+    for (int step = first; step < last; ++step) {
+        if (step > first) {
+            const int before = step == 2 ? SLOTS / LANES : STRIPS;
+            while (*(volatile __global int *)DONE(step - 1) < before) {}
+            atomic_add(DONE(step - 1), 0);      // what was written before the count is seen after it
+        }
+        const int count = step == 1 ? SLOTS / LANES : STRIPS;
+        for (int turn = 0; turn < workers; ++turn) {
+            const int owner = (self + turn) % workers;
+            const int start = owner * count / workers, end = (owner + 1) * count / workers;
+            for (int task = start + atomic_inc(TAKEN(step, owner)); task < end;
+                 task = start + atomic_inc(TAKEN(step, owner))) {
+                if (step == 0)
+                    restore_columns_forward(work, task, frame, spectrum, position, column_turns, column_blend);
+                else if (step == 1)
+                    restore_rows(work, task, spectrum, filtered, filter, long_axis, short_axis, row_turns,
+                                 row_blend, noise, scale);
+                else
+                    restore_columns_inverse(work, task, filtered, image, position, column_turns);
+                mem_fence(CLK_GLOBAL_MEM_FENCE);
+                atomic_inc(DONE(step));
+            }
+        }
+    }
+    if (atomic_inc(GONE) == workers - 1)        // the last leaves the counters as they were
+        for (int i = 0; i <= STEPS + STEPS * workers; ++i) tasks[16 * i] = 0;
 }

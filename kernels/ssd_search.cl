@@ -1,4 +1,4 @@
-// ssd_search.cl : find many templates in one image, each in its own window, in one launch.
+// ssd_search.cl : find many templates in one image, each in its own window, in one launch or two.
 //
 //   score "ssd"          SSD(o) = sum_r (I(o + r) - T(r))^2                       docs/maths.md, eq. S2, S3
 //   score "gain_offset"  R(o) = min over g >= 0, b of sum_r (g I(o + r) + b - T(r))^2 / sum_r (T(r) - mean T)^2
@@ -6,28 +6,30 @@
 //   best(o)              the smallest score; of equals the first in row-major order
 //
 //   image       (image_rows, image_columns) pixel   uchar, ushort or float, as IMAGE_KIND says
-//   templates   (count, PADDED_ROWS, TEMPLATE_COLUMNS) float   T less a constant, BLOCK_ROWS - 1 zero rows above and
-//                                                      below. Constant: 128 (uchar); 0 (ssd) or mean T (gain_offset)
-//   sums        (count, 2) int     uchar: sum T', sum T'^2 of the stored T'; else: bits of the float sum T'^2, unused
+//   templates   (count, TEMPLATE_ROWS, TEMPLATE_COLUMNS) float   T; less its mean for gain_offset of other than uchar
+//   sums        (count, 2) int     uchar: sum T, sum T^2; else: bits of the float sum T'^2 of the stored T', unused
 //   origins     (count, 2) int     row, column of each window's corner; the host keeps windows inside the image
-//   scores      (count, offset_rows, offset_columns) int    ssd of uchar: the integer; else the bits of a float >= 0
-//   tile_best   (count, tiles, 2) int                       a tile's smallest score and its row-major offset
+//   scores      (count, offset_rows, map_columns) int       offset_columns in each row, rounded up to whole tiles; ssd of
+//                                                      uchar: the integer; else the bits of a float >= 0
+//   tile_best   (count, tiles, 2) int                       a tile's smallest score and its row-major place in the map
 //   records     (count, 11 + PATCH_ROWS * PATCH_COLUMNS) int   row, column of the best place in the image; the 3 x 3
 //                                                      scores around it; the pixels around it as bits of floats
-//   All scores are >= 0, so their bits order as integers do; NaN becomes infinity, and a score outside the map is
+//   All scores are >= 0, so their bits order as integers do; NaN becomes infinity, and a score outside the offsets is
 //   SCORE_NONE.
 //
-// Family "lanes" (LANES > 0): a work-item owns BLOCK_ROWS x (VECTORS * LANES) offsets in vector registers; no local
-// memory, no barrier. Its window is copied once to private memory as float. On uchar each row of it meets BLOCK_ROWS
-// template rows at once, one multiply-add a tap; the zero rows spare every test for the template's ends.
-// Family "groups" (LANES == 0): a work-group of GROUP_COLUMNS x GROUP_ROWS items shares a window in local memory
+// Family "lanes" (VECTOR_BYTES > 0): a work-item owns a tile of TILE_ROWS x TILE_COLUMNS offsets, one offset a lane; no
+// local memory, no barrier. Its part of the window is copied once to private memory; BLOCK_ROWS x VECTORS vectors of
+// sums stay in registers while the template passes by. The only tile of a window writes the record itself.
+// Family "groups" (VECTOR_BYTES == 0): a work-group of GROUP_COLUMNS x GROUP_ROWS items shares a window in local memory
 // (TILE_ROWS + TEMPLATE_ROWS - 1) x (TILE_COLUMNS + TEMPLATE_COLUMNS - 1) pixels; an item owns ITEM_ROWS offsets
 // below each other and holds their window values in registers; one barrier, then a tree for the smallest.
-// ssd_search_best: one work-item (lanes) or one work-group (groups) a template.
+// ssd_search_best: the record from the best of all tiles, by one work-item (lanes) or work-group (groups) a template.
 //
 // Error: uchar ssd exact. Float ssd below (TEMPLATE_ROWS + TEMPLATE_COLUMNS + 2) / 2 eps relative, for it sums row by
 // row. gain_offset: uchar sums exact, then (8 + 4 TAPS/s) eps absolute, s the root of both centred sums of squares;
 // else (2 (rows + columns) + 4 span + 12) eps absolute, span the window's range in standard deviations of the place.
+
+#include "lanes.h"
 
 #ifndef IMAGE_KIND
 #define IMAGE_KIND 0          // 0 uchar, 1 ushort, 2 float
@@ -41,11 +43,8 @@
 #ifndef TEMPLATE_COLUMNS
 #define TEMPLATE_COLUMNS 20
 #endif
-#ifndef LANES
-#define LANES 16              // 4, 8 or 16 floats a vector; 0 selects the groups family
-#endif
 #ifndef BLOCK_ROWS
-#define BLOCK_ROWS 5          // lanes: offset rows of a work-item
+#define BLOCK_ROWS 3          // lanes: offset rows of a block
 #endif
 #ifndef VECTORS
 #define VECTORS 3             // lanes: vectors across; BLOCK_ROWS * VECTORS sums must fit the registers
@@ -54,7 +53,6 @@
 #define PATCH_MARGIN 0        // pixels around the template in the record's patch; negative: no patch
 #endif
 
-#define PADDED_ROWS (TEMPLATE_ROWS + 2 * (BLOCK_ROWS - 1))
 #define TAPS (TEMPLATE_ROWS * TEMPLATE_COLUMNS)
 #define SCORE_NONE 0x7fffffff
 #if PATCH_MARGIN < 0
@@ -67,99 +65,80 @@
 #define RECORD (11 + PATCH_ROWS * PATCH_COLUMNS)
 
 #if IMAGE_KIND == 0
-typedef uchar pixel;
+#define PIXEL uchar
 #elif IMAGE_KIND == 1
-typedef ushort pixel;
+#define PIXEL ushort
 #else
-typedef float pixel;
+#define PIXEL float
+#endif
+typedef PIXEL pixel;
+
+#if VECTOR_BYTES
+typedef JOIN(int, LANES) ivec;
+#define AS_IVEC(V) JOIN(as_int, LANES)(V)
+#else
+typedef int ivec;
+#define AS_IVEC(V) as_int(V)
 #endif
 
-#if LANES > 0
-#if LANES == 16
-typedef float16 vec;
-typedef int16 ivec;
-typedef uchar16 ucharv;
-typedef ushort16 ushortv;
-#define LANE_INDEX ((ivec)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
-#elif LANES == 8
-typedef float8 vec;
-typedef int8 ivec;
-typedef uchar8 ucharv;
-typedef ushort8 ushortv;
-#define LANE_INDEX ((ivec)(0, 1, 2, 3, 4, 5, 6, 7))
-#else
-typedef float4 vec;
-typedef int4 ivec;
-typedef uchar4 ucharv;
-typedef ushort4 ushortv;
-#define LANE_INDEX ((ivec)(0, 1, 2, 3))
-#endif
-typedef union { ivec all; int each[LANES]; } ivec_lanes;
-#define JOIN_(a, b) a##b
-#define JOIN(a, b) JOIN_(a, b)
-
-// Pointer casts with a lowered alignment: vloadN and convert_* are real calls in PoCL.
-typedef vec vec_any __attribute__((aligned(4)));
-typedef ivec ivec_any __attribute__((aligned(4)));
-typedef ucharv ucharv_any __attribute__((aligned(1)));
-typedef ushortv ushortv_any __attribute__((aligned(2)));
+// What sums are made in: integers stay exact.
 #if IMAGE_KIND == 0
-typedef ucharv_any pixels_any;
-#elif IMAGE_KIND == 1
-typedef ushortv_any pixels_any;
+typedef int number;
+typedef ivec numbers;
 #else
-typedef vec_any pixels_any;
+typedef float number;
+typedef vec numbers;
 #endif
 
-#ifndef __has_builtin
-#define __has_builtin(x) 0
-#endif
-#if __has_builtin(__builtin_convertvector)
-#define TO_VEC(v) __builtin_convertvector(v, vec)
-#define TO_IVEC(v) __builtin_convertvector(v, ivec)
-#else
-#define TO_VEC(v) JOIN(convert_float, LANES)(v)
-#define TO_IVEC(v) JOIN(convert_int, LANES)(v)
-#endif
+// ---- scores -------------------------------------------------------------------------------------------------
 
-typedef ivec integers;
-typedef vec reals;
-#define TO_INTEGERS(v) TO_IVEC(v)
-#define TO_REALS(v) TO_VEC(v)
-#define AS_INTEGERS(v) JOIN(as_int, LANES)(v)
-#else
-typedef int integers;
-typedef float reals;
-#define TO_INTEGERS(v) ((int)(v))
-#define TO_REALS(v) ((float)(v))
-#define AS_INTEGERS(v) as_int(v)
+#if GAIN_OFFSET
+// Eq. S5, from n times the covariance and the variances.
+ALWAYS_INLINE vec gain_offset_score(const vec covariance, const vec image_variance, const float template_variance)
+{
+    const vec residual = 1.0f - (covariance / image_variance) * (covariance / template_variance);
+    const vec score = residual > 0.0f ? residual : (vec)0.0f;
+    return ((covariance > 0.0f) & (image_variance > 0.0f)) ? score : (vec)1.0f;
+}
 #endif
 
 #if GAIN_OFFSET && IMAGE_KIND == 0
-// Eq. S6: the sums are first moved, exactly, to about the footprint's own rounded mean, so that what is left to
-// subtract is at most TAPS and float32 loses nothing.
-static inline __attribute__((always_inline)) integers gain_offset_bits(
-    const integers image_1, const integers image_2, const integers cross, const int template_1, const int template_2)
+// Eq. S6: the sums are first moved, exactly, to about the footprint's own mean, so that what is left to subtract is at
+// most TAPS and float32 loses nothing.
+ALWAYS_INLINE ivec gain_offset_bits(
+    const ivec image_1, const ivec image_2, const ivec cross, const int template_1, const int template_2)
 {
-    const integers mean = TO_INTEGERS(TO_REALS(image_1) * (1.0f / TAPS));
-    const integers rest = image_1 - mean * TAPS;
+    const ivec mean = CONVERT(CONVERT(image_1, float) * (1.0f / TAPS), int);
+    const ivec rest = image_1 - mean * TAPS;
     const int template_mean = template_1 / TAPS;
     const int template_rest = template_1 - template_mean * TAPS;
-    const reals image_variance = TO_REALS(image_2 - mean * (image_1 + rest))
-                                 - TO_REALS(rest) * TO_REALS(rest) * (1.0f / TAPS);
+    const vec image_variance = CONVERT(image_2 - mean * (image_1 + rest), float)
+                               - CONVERT(rest, float) * CONVERT(rest, float) * (1.0f / TAPS);
     const float template_variance = (float)(template_2 - template_mean * (template_1 + template_rest))
                                     - (float)template_rest * (float)template_rest * (1.0f / TAPS);
-    const reals covariance = TO_REALS(cross - mean * template_rest - image_1 * template_mean)
-                             - TO_REALS(rest) * ((float)template_rest * (1.0f / TAPS));
-    const reals residual = 1.0f - (covariance / image_variance) * (covariance / template_variance);
-    const reals score = residual > 0.0f ? residual : (reals)0.0f;
-    return AS_INTEGERS(((covariance > 0.0f) & (image_variance > 0.0f)) ? score : (reals)1.0f);
+    const vec covariance = CONVERT(cross - mean * template_rest - image_1 * template_mean, float)
+                           - CONVERT(rest, float) * ((float)template_rest * (1.0f / TAPS));
+    return AS_IVEC(gain_offset_score(covariance, image_variance, template_variance));
+}
+#endif
+
+#if IMAGE_KIND != 0
+// A footprint that holds NaN or infinity matches nothing.
+ALWAYS_INLINE ivec score_bits(const vec value)
+{
+    return AS_IVEC(value >= 0.0f ? value : (vec)INFINITY);
 }
 #endif
 
 #if GAIN_OFFSET && IMAGE_KIND != 0
+ALWAYS_INLINE ivec centred_bits(const vec covariance, const vec image_variance, const float template_variance)
+{
+    const vec score = gain_offset_score(covariance, image_variance, template_variance);
+    return score_bits(image_variance < INFINITY ? score : (vec)INFINITY);
+}
+
 // A grey level of the window, so that means taken from it lose nothing; the same for all tiles of a window.
-static inline float window_level(__global const pixel *image, __global const int *origin, const int image_columns,
+ALWAYS_INLINE float window_level(__global const pixel *image, __global const int *origin, const int image_columns,
                                  const int offset_rows, const int offset_columns)
 {
     const int row = origin[0] + (offset_rows + TEMPLATE_ROWS - 1) / 2;
@@ -168,154 +147,272 @@ static inline float window_level(__global const pixel *image, __global const int
 }
 #endif
 
-#if LANES > 0
+// The index nearest to `i` of 0 to n - 1; clamp is a call on some compilers.
+ALWAYS_INLINE int nearest(const int i, const int n)
+{
+    return i < 0 ? 0 : i < n ? i : n - 1;
+}
+
+// One work-item of `items` writes its share of a template's record: where the best place lies, the scores around it,
+// and the pixels; beyond the image's edge these repeat the last one.
+ALWAYS_INLINE void write_record(
+    __global int *record, __global const pixel *image, __global const int *origin, __global const int *map,
+    const int place, const int image_rows, const int image_columns, const int offset_rows, const int offset_columns,
+    const int map_columns, const int item, const int items)
+{
+    const int y = place / map_columns;
+    const int x = place - y * map_columns;
+    const int top = origin[0] + y;
+    const int left = origin[1] + x;
+    if (item == 0) {
+        record[0] = top;
+        record[1] = left;
+        for (int ny = y - 1; ny <= y + 1; ++ny) {
+            for (int nx = x - 1; nx <= x + 1; ++nx) {
+                const int inside = ny >= 0 && ny < offset_rows && nx >= 0 && nx < offset_columns;
+                record[2 + 3 * (ny - y + 1) + nx - x + 1] = inside ? map[ny * map_columns + nx] : SCORE_NONE;
+            }
+        }
+    }
+#if PATCH_ROWS > 0
+    const int start = left - PATCH_MARGIN;
+    const int inside = start >= 0 && start + PATCH_COLUMNS <= image_columns;
+    for (int r = 0; r < PATCH_ROWS; ++r) {
+        __global const pixel *from = image + nearest(top - PATCH_MARGIN + r, image_rows) * image_columns;
+        __global int *to = record + 11 + r * PATCH_COLUMNS;
+        for (int c = item; c < PATCH_COLUMNS; c += items)
+            to[c] = as_int((float)from[inside ? start + c : nearest(start + c, image_columns)]);
+    }
+#endif
+}
+
+#if VECTOR_BYTES
 // ---- lanes --------------------------------------------------------------------------------------------------
 
-#define TILE_ROWS BLOCK_ROWS
-#define TILE_COLUMNS (VECTORS * LANES)
-#define WINDOW_ROWS (BLOCK_ROWS + TEMPLATE_ROWS - 1)
+#ifndef TILE_ROWS
+#define TILE_ROWS BLOCK_ROWS  // lanes: a multiple of BLOCK_ROWS
+#endif
+#ifndef TILE_COLUMNS
+#define TILE_COLUMNS (VECTORS * LANES)   // lanes: a multiple of that
+#endif
+#define WINDOW_ROWS (TILE_ROWS + TEMPLATE_ROWS - 1)
 #define PITCH ((TILE_COLUMNS + TEMPLATE_COLUMNS - 1 + LANES - 1) / LANES * LANES)
 
+#if LANES == 16
+#define LANE_INDEX ((ivec)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
+#elif LANES == 8
+#define LANE_INDEX ((ivec)(0, 1, 2, 3, 4, 5, 6, 7))
+#else
+#define LANE_INDEX ((ivec)(0, 1, 2, 3))
+#endif
+
+// For every vector of a block.
+#define EACH(K, J)                                  \
+    _Pragma("unroll")                               \
+    for (int K = 0; K < BLOCK_ROWS; ++K)            \
+        _Pragma("unroll")                           \
+        for (int J = 0; J < VECTORS; ++J)
+
+// Pointer casts with a lowered alignment: vloadN is a call on some compilers.
+typedef vec vec_any __attribute__((aligned(4)));
+typedef ivec ivec_any __attribute__((aligned(4)));
+typedef JOIN(PIXEL, LANES) pixels_any __attribute__((aligned(sizeof(pixel))));
+
 #if IMAGE_KIND == 0
-// A centred product is at most 2^14: float32 adds 1024 of them exactly, then they move to integers.
-#define FLUSH_ROWS (1024 / TEMPLATE_COLUMNS)
+// A cell holds a pixel and its right neighbour, and so does a tap: two products and their sum are one instruction of
+// most processors.
+#if LANES == 8
+typedef short16 cells;
+#define AS_LONGS(V) as_ulong4(V)
+#elif LANES == 4
+typedef short8 cells;
+#define AS_LONGS(V) as_ulong2(V)
+#else
+#error "uchar takes VECTOR_BYTES 16 or 32: no vector of OpenCL C holds 32 shorts"
+#endif
+typedef short2 cell;
+#define CELL_PIXELS 2
 
-// Sums over the template's footprint of `power` 1 or 2 of the window, exact in int: down the columns, then along.
-static inline __attribute__((always_inline)) void window_sums(const float *window, const int row, const int power,
-                                                              ivec *sums)
+// sum + a.even * b.even + a.odd * b.odd, for sums from 0 to 2^31. Added as 64-bit numbers, where then nothing carries
+// from half to half: else a compiler adds the two products one after the other and misses that instruction.
+ALWAYS_INLINE ivec multiply_add(const ivec sum, const cells a, const cells b)
 {
-    int columns[PITCH] __attribute__((aligned(64)));
-    #pragma unroll 1
-    for (int x = 0; x < PITCH; x += LANES) {
-        vec total = 0.0f;
-        #pragma unroll 1
-        for (int r = row; r < row + TEMPLATE_ROWS; ++r) {
-            const vec value = *(const vec *)(window + r * PITCH + x);
-            total += power == 2 ? value * value : value;
-        }
-        *(ivec *)(columns + x) = TO_IVEC(total);
-    }
-    #pragma unroll
-    for (int j = 0; j < VECTORS; ++j) sums[j] = 0;
-    #pragma unroll 1
-    for (int c = 0; c < TEMPLATE_COLUMNS; ++c) {
-        #pragma unroll
-        for (int j = 0; j < VECTORS; ++j) sums[j] += *(const ivec_any *)(columns + c + j * LANES);
-    }
-}
-
-// sum I'T' for every offset of the tile, exact.
-static inline __attribute__((always_inline)) void correlate(const float *window, __global const float *padded,
-                                                            ivec cross[BLOCK_ROWS][VECTORS])
-{
-    #pragma unroll
-    for (int k = 0; k < BLOCK_ROWS; ++k)
-        #pragma unroll
-        for (int j = 0; j < VECTORS; ++j) cross[k][j] = 0;
-
-    #pragma unroll 1
-    for (int first = 0; first < WINDOW_ROWS; first += FLUSH_ROWS) {
-        vec sum[BLOCK_ROWS][VECTORS];
-        #pragma unroll
-        for (int k = 0; k < BLOCK_ROWS; ++k)
-            #pragma unroll
-            for (int j = 0; j < VECTORS; ++j) sum[k][j] = 0.0f;
-
-        const int last = first + FLUSH_ROWS < WINDOW_ROWS ? first + FLUSH_ROWS : WINDOW_ROWS;
-        #pragma unroll 1
-        for (int y = first; y < last; ++y) {
-            const float *row = window + y * PITCH;
-            __global const float *taps = padded + (y + BLOCK_ROWS - 1) * TEMPLATE_COLUMNS;
-            #pragma unroll 1
-            for (int c = 0; c < TEMPLATE_COLUMNS; ++c) {
-                vec value[VECTORS];
-                #pragma unroll
-                for (int j = 0; j < VECTORS; ++j) value[j] = *(const vec_any *)(row + c + j * LANES);
-                #pragma unroll
-                for (int k = 0; k < BLOCK_ROWS; ++k) {
-                    const float tap = taps[c - k * TEMPLATE_COLUMNS];
-                    #pragma unroll
-                    for (int j = 0; j < VECTORS; ++j) sum[k][j] += tap * value[j];
-                }
-            }
-        }
-        #pragma unroll
-        for (int k = 0; k < BLOCK_ROWS; ++k)
-            #pragma unroll
-            for (int j = 0; j < VECTORS; ++j) cross[k][j] += TO_IVEC(sum[k][j]);
-    }
-}
-#elif !GAIN_OFFSET
-// Direct squared differences, summed along a row first and then down, which bounds the rounding error.
-static inline __attribute__((always_inline)) void squared_differences(const float *window,
-                                                                      __global const float *taps, vec *total)
-{
-    #pragma unroll
-    for (int j = 0; j < VECTORS; ++j) total[j] = 0.0f;
-    #pragma unroll 1
-    for (int r = 0; r < TEMPLATE_ROWS; ++r) {
-        vec along[VECTORS];
-        #pragma unroll
-        for (int j = 0; j < VECTORS; ++j) along[j] = 0.0f;
-        #pragma unroll 1
-        for (int c = 0; c < TEMPLATE_COLUMNS; ++c) {
-            const float tap = taps[r * TEMPLATE_COLUMNS + c];
-            #pragma unroll
-            for (int j = 0; j < VECTORS; ++j) {
-                const vec difference = *(const vec_any *)(window + r * PITCH + c + j * LANES) - tap;
-                along[j] += difference * difference;
-            }
-        }
-        #pragma unroll
-        for (int j = 0; j < VECTORS; ++j) total[j] += along[j];
-    }
+    const ivec products = CONVERT(a.even, int) * CONVERT(b.even, int) + CONVERT(a.odd, int) * CONVERT(b.odd, int);
+    return AS_IVEC(AS_LONGS(sum) + AS_LONGS(products));
 }
 #else
-// Two passes, as the expanded form cancels on bright images: the mean of each footprint, then its centred sums.
-static inline __attribute__((always_inline)) void centred_sums(const float *window, __global const float *taps,
-                                                               vec *squares, vec *cross)
-{
-    vec mean[VECTORS];
-    #pragma unroll
-    for (int j = 0; j < VECTORS; ++j) mean[j] = squares[j] = cross[j] = 0.0f;
-    #pragma unroll 1
-    for (int r = 0; r < TEMPLATE_ROWS; ++r) {
-        vec along[VECTORS];
-        #pragma unroll
-        for (int j = 0; j < VECTORS; ++j) along[j] = 0.0f;
-        #pragma unroll 1
-        for (int c = 0; c < TEMPLATE_COLUMNS; ++c)
-            #pragma unroll
-            for (int j = 0; j < VECTORS; ++j)
-                along[j] += *(const vec_any *)(window + r * PITCH + c + j * LANES);
-        #pragma unroll
-        for (int j = 0; j < VECTORS; ++j) mean[j] += along[j];
-    }
-    #pragma unroll
-    for (int j = 0; j < VECTORS; ++j) mean[j] *= 1.0f / TAPS;
+typedef vec cells;
+typedef float cell;
+#define CELL_PIXELS 1
+#endif
+typedef cells cells_any __attribute__((aligned(4)));
+#define TAP_COLUMNS ((TEMPLATE_COLUMNS + CELL_PIXELS - 1) / CELL_PIXELS)
 
+// The tile's part of the window, less `level`; zero where the window has ended.
+ALWAYS_INLINE void copy_window(__global const pixel *corner, const int image_columns, const int rows, const int columns,
+                               const float level, cell *window)
+{
+    const int whole = columns - (IMAGE_KIND == 0);   // of bytes the last has no neighbour
     #pragma unroll 1
-    for (int r = 0; r < TEMPLATE_ROWS; ++r) {
-        vec along[VECTORS], across[VECTORS];
-        #pragma unroll
-        for (int j = 0; j < VECTORS; ++j) along[j] = across[j] = 0.0f;
+    for (int y = 0; y < WINDOW_ROWS; ++y) {
+        __global const pixel *from = corner + y * image_columns;
+        cell *to = window + y * PITCH;
         #pragma unroll 1
-        for (int c = 0; c < TEMPLATE_COLUMNS; ++c) {
-            const float tap = taps[r * TEMPLATE_COLUMNS + c];
-            #pragma unroll
-            for (int j = 0; j < VECTORS; ++j) {
-                const vec value = *(const vec_any *)(window + r * PITCH + c + j * LANES) - mean[j];
-                along[j] += value * value;
-                across[j] += tap * value;
+        for (int x = 0; x < PITCH; x += LANES) *(cells *)(to + x) = 0;
+        if (y >= rows) continue;
+        int x = 0;
+        if (whole >= LANES) {
+            #pragma unroll 1
+            for (; x < whole; x += LANES) {
+                const int at = x + LANES <= whole ? x : whole - LANES;   // the last vector overlaps the one before
+                cells value;
+#if IMAGE_KIND == 0
+                value.even = CONVERT(*(__global const pixels_any *)(from + at), short);
+                value.odd = CONVERT(*(__global const pixels_any *)(from + at + 1), short);
+#else
+                value = CONVERT(*(__global const pixels_any *)(from + at), float) - level;
+#endif
+                *(cells_any *)(to + at) = value;
             }
         }
-        #pragma unroll
-        for (int j = 0; j < VECTORS; ++j) { squares[j] += along[j]; cross[j] += across[j]; }
+        #pragma unroll 1
+        for (x = x < whole ? x : whole; x < columns; ++x) {
+#if IMAGE_KIND == 0
+            to[x] = (short2)(from[x], x < whole ? from[x + 1] : 0);
+#else
+            to[x] = (float)from[x] - level;
+#endif
+        }
+    }
+}
+
+#if IMAGE_KIND == 0 || GAIN_OFFSET
+// Sums along a row, of TEMPLATE_COLUMNS pixels or their squares.
+ALWAYS_INLINE numbers sum_along(const cell *row, const int squared)
+{
+    cells sum = 0;
+    ivec squares = 0;
+    #pragma unroll
+    for (int c = 0; c < TEMPLATE_COLUMNS; c += CELL_PIXELS) {
+        cells value = *(const cells_any *)(row + c);
+#if IMAGE_KIND == 0
+        if (c + 1 == TEMPLATE_COLUMNS) value.odd = 0;
+        if (squared) squares = multiply_add(squares, value, value);
+#endif
+        sum += value;
+    }
+#if IMAGE_KIND == 0
+    return squared ? squares : CONVERT(sum.even, int) + CONVERT(sum.odd, int);
+#else
+    return sum;
+#endif
+}
+
+// Sums over every footprint of the tile, along the rows first and then down: integers each from the one above it.
+ALWAYS_INLINE void footprint_sums(const cell *window, const int squared, number *sums)
+{
+    #pragma unroll 1
+    for (int x = 0; x < TILE_COLUMNS; x += LANES) {
+        numbers along[WINDOW_ROWS], total;
+        #pragma unroll 1
+        for (int y = 0; y < WINDOW_ROWS; ++y) along[y] = sum_along(window + y * PITCH + x, squared);
+        #pragma unroll 1
+        for (int k = 0; k < TILE_ROWS; ++k) {
+            if (IMAGE_KIND == 0 && k > 0) {
+                total += along[k + TEMPLATE_ROWS - 1] - along[k - 1];
+            } else {
+                total = 0;
+                #pragma unroll 1
+                for (int r = 0; r < TEMPLATE_ROWS; ++r) total += along[k + r];
+            }
+            *(numbers *)(sums + k * TILE_COLUMNS + x) = total;
+        }
     }
 }
 #endif
 
-__kernel void __attribute__((reqd_work_group_size(1, 1, 1)))
+#if IMAGE_KIND == 0
+// Row y of the window is row y - k of the template's footprint k rows down: adds what they share to the block's sums.
+ALWAYS_INLINE void correlate_row(const cell *window, const cells *taps, const int y, ivec cross[BLOCK_ROWS][VECTORS])
+{
+    #pragma unroll 1
+    for (int c = 0; c < TAP_COLUMNS; ++c) {
+        cells value[VECTORS];
+        #pragma unroll
+        for (int j = 0; j < VECTORS; ++j)
+            value[j] = *(const cells_any *)(window + y * PITCH + c * CELL_PIXELS + j * LANES);
+        EACH(k, j)
+            if (y - k >= 0 && y - k < TEMPLATE_ROWS)
+                cross[k][j] = multiply_add(cross[k][j], value[j], taps[(y - k) * TAP_COLUMNS + c]);
+    }
+}
+
+// sum I T for a block of offsets, exact.
+ALWAYS_INLINE void correlate(const cell *window, const cells *taps, ivec cross[BLOCK_ROWS][VECTORS])
+{
+    EACH(k, j) cross[k][j] = 0;
+    #pragma unroll
+    for (int y = 0; y < BLOCK_ROWS - 1; ++y) correlate_row(window, taps, y, cross);
+    #pragma unroll 1
+    for (int y = BLOCK_ROWS - 1; y < TEMPLATE_ROWS; ++y) correlate_row(window, taps, y, cross);
+    #pragma unroll
+    for (int y = 0; y < BLOCK_ROWS - 1; ++y)
+        correlate_row(window, taps, (TEMPLATE_ROWS > BLOCK_ROWS - 1 ? TEMPLATE_ROWS : BLOCK_ROWS - 1) + y, cross);
+}
+#elif !GAIN_OFFSET
+// Squared differences, summed along a row first and then down, which bounds the rounding error.
+ALWAYS_INLINE void squared_differences(const cell *window, __global const float *taps, vec total[BLOCK_ROWS][VECTORS])
+{
+    EACH(k, j) total[k][j] = 0.0f;
+    #pragma unroll 1
+    for (int r = 0; r < TEMPLATE_ROWS; ++r) {
+        vec along[BLOCK_ROWS][VECTORS];
+        EACH(k, j) along[k][j] = 0.0f;
+        #pragma unroll 1
+        for (int c = 0; c < TEMPLATE_COLUMNS; ++c) {
+            const cell *at = window + r * PITCH + c;
+            const float tap = taps[r * TEMPLATE_COLUMNS + c];
+            EACH(k, j) {
+                const vec difference = *(const cells_any *)(at + k * PITCH + j * LANES) - tap;
+                along[k][j] += difference * difference;
+            }
+        }
+        EACH(k, j) total[k][j] += along[k][j];
+    }
+}
+#else
+// Sums of the footprints less their means, as the expanded form cancels on bright images.
+ALWAYS_INLINE void centred_sums(const cell *window, __global const float *taps, const number *sums,
+                                vec squares[BLOCK_ROWS][VECTORS], vec cross[BLOCK_ROWS][VECTORS])
+{
+    vec mean[BLOCK_ROWS][VECTORS];
+    EACH(k, j) {
+        mean[k][j] = *(const numbers *)(sums + k * TILE_COLUMNS + j * LANES) * (1.0f / TAPS);
+        squares[k][j] = cross[k][j] = 0.0f;
+    }
+    #pragma unroll 1
+    for (int r = 0; r < TEMPLATE_ROWS; ++r) {
+        vec along[BLOCK_ROWS][VECTORS], across[BLOCK_ROWS][VECTORS];
+        EACH(k, j) along[k][j] = across[k][j] = 0.0f;
+        #pragma unroll 1
+        for (int c = 0; c < TEMPLATE_COLUMNS; ++c) {
+            const cell *at = window + r * PITCH + c;
+            const float tap = taps[r * TEMPLATE_COLUMNS + c];
+            EACH(k, j) {
+                const vec value = *(const cells_any *)(at + k * PITCH + j * LANES) - mean[k][j];
+                along[k][j] += value * value;
+                across[k][j] += tap * value;
+            }
+        }
+        EACH(k, j) {
+            squares[k][j] += along[k][j];
+            cross[k][j] += across[k][j];
+        }
+    }
+}
+#endif
+
+__kernel WIDE void __attribute__((reqd_work_group_size(1, 1, 1)))
 ssd_search(
     __global const pixel *image,
     __global const float *templates,
@@ -323,110 +420,94 @@ ssd_search(
     __global const int   *origins,
     __global int         *scores,
     __global int         *tile_best,
+    __global int         *records,
     const int image_rows, const int image_columns,
-    const int offset_rows, const int offset_columns)
+    const int offset_rows, const int offset_columns,
+    const int map_columns)
 {
     const int x0 = (int)get_global_id(0) * TILE_COLUMNS;
     const int y0 = (int)get_global_id(1) * TILE_ROWS;
     const int index = (int)get_global_id(2);
-
-    const int rows = min(WINDOW_ROWS, offset_rows + TEMPLATE_ROWS - 1 - y0);
-    const int columns = min((int)(TILE_COLUMNS + TEMPLATE_COLUMNS - 1), offset_columns + TEMPLATE_COLUMNS - 1 - x0);
-    __global const pixel *corner = image + (origins[2 * index] + y0) * image_columns + origins[2 * index + 1] + x0;
-#if IMAGE_KIND == 0
-    const float level = 128.0f;
-#elif GAIN_OFFSET
-    const float level = window_level(image, origins + 2 * index, image_columns, offset_rows, offset_columns);
+    __global const int *origin = origins + 2 * index;
+    __global const float *taps = templates + index * TAPS;
+    __global int *map = scores + index * offset_rows * map_columns;
+#if IMAGE_KIND != 0 && GAIN_OFFSET
+    const float level = window_level(image, origin, image_columns, offset_rows, offset_columns);
 #else
     const float level = 0.0f;
 #endif
 
-    float window[WINDOW_ROWS * PITCH] __attribute__((aligned(64)));
-    #pragma unroll 1
-    for (int y = 0; y < WINDOW_ROWS; ++y) {
-        __global const pixel *from = corner + y * image_columns;
-        float *to = window + y * PITCH;
-        const int have = y < rows ? columns : 0;
-        int x = 0;
-        #pragma unroll 1
-        for (; x + LANES <= have; x += LANES)
-            *(vec *)(to + x) = TO_VEC(*(__global const pixels_any *)(from + x)) - level;
-        #pragma unroll 1
-        for (; x < have; ++x) to[x] = (float)from[x] - level;
-        #pragma unroll 1
-        for (; x < PITCH; ++x) to[x] = 0.0f;
-    }
+    cell window[WINDOW_ROWS * PITCH] __attribute__((aligned(64)));
+    copy_window(image + (origin[0] + y0) * image_columns + origin[1] + x0, image_columns,
+                min(WINDOW_ROWS, offset_rows + TEMPLATE_ROWS - 1 - y0),
+                min(TILE_COLUMNS + TEMPLATE_COLUMNS - 1, offset_columns + TEMPLATE_COLUMNS - 1 - x0), level, window);
 
-    __global const float *padded = templates + index * (PADDED_ROWS * TEMPLATE_COLUMNS);
 #if IMAGE_KIND == 0
-    ivec cross[BLOCK_ROWS][VECTORS];
-    correlate(window, padded, cross);
-#else
-    __global const float *taps = padded + (BLOCK_ROWS - 1) * TEMPLATE_COLUMNS;
+    cells pairs[TEMPLATE_ROWS * TAP_COLUMNS];   // whole vectors: taps spread at their use miss that instruction too
+    #pragma unroll 1
+    for (int i = 0; i < TEMPLATE_ROWS * TAP_COLUMNS; ++i) {
+        const int c = i % TAP_COLUMNS * 2;
+        __global const float *tap = taps + i / TAP_COLUMNS * TEMPLATE_COLUMNS + c;
+        pairs[i].even = (short)tap[0];
+        pairs[i].odd = c + 1 < TEMPLATE_COLUMNS ? (short)tap[1] : 0;
+    }
+    number squares[TILE_ROWS * TILE_COLUMNS] __attribute__((aligned(64)));
+    footprint_sums(window, 1, squares);
 #endif
+#if GAIN_OFFSET
+    number pixels[TILE_ROWS * TILE_COLUMNS] __attribute__((aligned(64)));
+    footprint_sums(window, 0, pixels);
+#endif
+
+    const int rows = offset_rows - y0 < TILE_ROWS ? offset_rows - y0 : TILE_ROWS;
+    __global int *to = map + y0 * map_columns + x0;
+    #pragma unroll 1
+    for (int y = 0; y < TILE_ROWS; y += BLOCK_ROWS) {
+        #pragma unroll 1
+        for (int x = 0; x < TILE_COLUMNS; x += VECTORS * LANES) {
+            const cell *corner = window + y * PITCH + x;
+            ivec score[BLOCK_ROWS][VECTORS];
+#if IMAGE_KIND == 0
+            ivec cross[BLOCK_ROWS][VECTORS];
+            correlate(corner, pairs, cross);
+            EACH(k, j) {
+                const int at = (y + k) * TILE_COLUMNS + x + j * LANES;
+                const ivec square = *(const numbers *)(squares + at);
+#if GAIN_OFFSET
+                score[k][j] = gain_offset_bits(*(const numbers *)(pixels + at), square, cross[k][j], sums[2 * index],
+                                               sums[2 * index + 1]);
+#else
+                score[k][j] = square + sums[2 * index + 1] - 2 * cross[k][j];
+#endif
+            }
+#elif GAIN_OFFSET
+            vec square[BLOCK_ROWS][VECTORS], cross[BLOCK_ROWS][VECTORS];
+            centred_sums(corner, taps, pixels + y * TILE_COLUMNS + x, square, cross);
+            EACH(k, j) score[k][j] = centred_bits(cross[k][j], square[k][j], as_float(sums[2 * index]));
+#else
+            vec total[BLOCK_ROWS][VECTORS];
+            squared_differences(corner, taps, total);
+            EACH(k, j) score[k][j] = score_bits(total[k][j]);
+#endif
+            EACH(k, j)
+                if (y + k < rows) *(__global ivec_any *)(to + (y + k) * map_columns + x + j * LANES) = score[k][j];
+        }
+    }
 
     ivec best = SCORE_NONE, best_at = 0;
-    const int valid_rows = min(TILE_ROWS, offset_rows - y0);
     #pragma unroll 1
-    for (int k = 0; k < valid_rows; ++k) {
-        ivec score[VECTORS];
-#if IMAGE_KIND == 0
-        ivec squares[VECTORS];
-        window_sums(window, k, 2, squares);
-#if GAIN_OFFSET
-        ivec means[VECTORS];
-        window_sums(window, k, 1, means);
-        #pragma unroll
-        for (int j = 0; j < VECTORS; ++j)
-            score[j] = gain_offset_bits(means[j], squares[j], cross[k][j], sums[2 * index], sums[2 * index + 1]);
-#else
-        #pragma unroll
-        for (int j = 0; j < VECTORS; ++j) score[j] = squares[j] + sums[2 * index + 1] - 2 * cross[k][j];
-#endif
-#else
-        vec value[VECTORS];
-#if GAIN_OFFSET
-        vec squares[VECTORS], product[VECTORS];
-        centred_sums(window + k * PITCH, taps, squares, product);
-        const float template_squares = as_float(sums[2 * index]);
-        #pragma unroll
-        for (int j = 0; j < VECTORS; ++j) {
-            const vec residual = 1.0f - (product[j] / squares[j]) * (product[j] / template_squares);
-            value[j] = product[j] > 0.0f ? (residual > 0.0f ? residual : (vec)0.0f) : (vec)1.0f;
-            // A footprint that holds NaN or infinity matches nothing.
-            value[j] = squares[j] < INFINITY ? value[j] : (vec)INFINITY;
-        }
-#else
-        squared_differences(window + k * PITCH, taps, value);
-#endif
-        #pragma unroll
-        for (int j = 0; j < VECTORS; ++j) {
-            value[j] = value[j] >= 0.0f ? value[j] : (vec)INFINITY;
-            score[j] = AS_INTEGERS(value[j]);
-        }
-#endif
-        __global int *to = scores + (index * offset_rows + y0 + k) * offset_columns + x0;
-        #pragma unroll
-        for (int j = 0; j < VECTORS; ++j) {
-            const ivec at = LANE_INDEX + j * LANES;
-            const ivec outside = at >= offset_columns - x0;
-            const ivec place = at + ((y0 + k) * offset_columns + x0);
-            if (j * LANES + LANES <= offset_columns - x0) {
-                *(__global ivec_any *)(to + j * LANES) = score[j];
-            } else {
-                ivec_lanes out;
-                out.all = score[j];
-                #pragma unroll 1
-                for (int i = 0; i < offset_columns - x0 - j * LANES; ++i) to[j * LANES + i] = out.each[i];
-            }
-            const ivec checked = outside ? (ivec)SCORE_NONE : score[j];
-            const ivec better = checked < best;
-            best_at = better ? place : best_at;
-            best = better ? checked : best;
+    for (int y = 0; y < rows; ++y) {
+        #pragma unroll 1
+        for (int x = 0; x < TILE_COLUMNS; x += LANES) {
+            const ivec column = LANE_INDEX + (x0 + x);
+            const ivec score = *(__global const ivec_any *)(to + y * map_columns + x);
+            const ivec better = (column < offset_columns) & (score < best);
+            best = better ? score : best;
+            best_at = better ? column + (y0 + y) * map_columns : best_at;
         }
     }
 
-    ivec_lanes value, place;
+    union { ivec all; int each[LANES]; } value, place;
     value.all = best;
     place.all = best_at;
     int smallest = SCORE_NONE, smallest_at = SCORE_NONE;
@@ -439,8 +520,13 @@ ssd_search(
     }
     const int tiles = (int)(get_global_size(0) * get_global_size(1));
     const int tile = (int)(get_global_id(1) * get_global_size(0) + get_global_id(0));
-    tile_best[2 * (index * tiles + tile)] = smallest;
-    tile_best[2 * (index * tiles + tile) + 1] = smallest_at;
+    if (tiles == 1) {
+        write_record(records + index * RECORD, image, origin, map, smallest_at, image_rows, image_columns, offset_rows,
+                     offset_columns, map_columns, 0, 1);
+    } else {
+        tile_best[2 * (index * tiles + tile)] = smallest;
+        tile_best[2 * (index * tiles + tile) + 1] = smallest_at;
+    }
 }
 
 #define BEST_ITEMS 1
@@ -458,11 +544,21 @@ ssd_search(
 #define PITCH (TILE_COLUMNS + TEMPLATE_COLUMNS - 1)
 #define BEST_ITEMS 64
 
-#if IMAGE_KIND == 0
-typedef int number;           // exact
-#else
-typedef float number;
-#endif
+// A tree over the items of a group; the smallest score and its place end up at 0, which item 0 may read at once.
+ALWAYS_INLINE void keep_smallest(__local int *best, __local int *at, const int item, const int items)
+{
+    for (int half_items = items / 2; half_items > 0; half_items /= 2) {
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (item < half_items) {
+            const int other = best[item + half_items];
+            const int other_at = at[item + half_items];
+            if (other < best[item] || (other == best[item] && other_at < at[item])) {
+                best[item] = other;
+                at[item] = other_at;
+            }
+        }
+    }
+}
 
 __kernel void __attribute__((reqd_work_group_size(GROUP_COLUMNS, GROUP_ROWS, 1)))
 ssd_search(
@@ -472,8 +568,10 @@ ssd_search(
     __global const int   *origins,
     __global int         *scores,
     __global int         *tile_best,
+    __global int         *records,
     const int image_rows, const int image_columns,
-    const int offset_rows, const int offset_columns)
+    const int offset_rows, const int offset_columns,
+    const int map_columns)
 {
     const int x0 = (int)get_group_id(0) * TILE_COLUMNS;
     const int y0 = (int)get_group_id(1) * TILE_ROWS;
@@ -492,17 +590,15 @@ ssd_search(
             window[y * PITCH + x] = y < rows && x < columns ? corner[y * image_columns + x] : (pixel)0;
     barrier(CLK_LOCAL_MEM_FENCE);
 
-#if IMAGE_KIND == 0
-    const number level = 128;
-#elif GAIN_OFFSET
+#if IMAGE_KIND != 0 && GAIN_OFFSET
     const number level = window_level(image, origins + 2 * index, image_columns, offset_rows, offset_columns);
 #else
-    const number level = 0.0f;
+    const number level = 0;
 #endif
 
     const int column = (int)get_local_id(0);
     const int row = (int)get_local_id(1) * ITEM_ROWS;
-    __global const float *taps = templates + (index * PADDED_ROWS + BLOCK_ROWS - 1) * TEMPLATE_COLUMNS;
+    __global const float *taps = templates + index * TAPS;
     // Columns outermost and rows innermost: each window value is read once and serves ITEM_ROWS offsets.
 #if GAIN_OFFSET
     number total[ITEM_ROWS];
@@ -585,36 +681,22 @@ ssd_search(
         const int score = gain_offset_bits(total[k], squares[k], cross[k], sums[2 * index], sums[2 * index + 1]);
 #elif IMAGE_KIND == 0
         const int score = squares[k];
+#elif GAIN_OFFSET
+        const int score = centred_bits(cross[k], squares[k], as_float(sums[2 * index]));
 #else
-#if GAIN_OFFSET
-        const float residual = 1.0f - (cross[k] / squares[k]) * (cross[k] / as_float(sums[2 * index]));
-        float value = cross[k] > 0.0f ? (residual > 0.0f ? residual : 0.0f) : 1.0f;
-        value = squares[k] < INFINITY ? value : INFINITY;
-#else
-        const float value = squares[k];
+        const int score = score_bits(squares[k]);
 #endif
-        const int score = as_int(value >= 0.0f ? value : INFINITY);
-#endif
-        scores[(index * offset_rows + y) * offset_columns + x] = score;
+        const int place = y * map_columns + x;
+        scores[index * offset_rows * map_columns + place] = score;
         if (score < smallest) {
             smallest = score;
-            smallest_at = y * offset_columns + x;
+            smallest_at = place;
         }
     }
 
     local_best[item] = smallest;
     local_at[item] = smallest_at;
-    for (int half_items = GROUP_ITEMS / 2; half_items > 0; half_items /= 2) {
-        barrier(CLK_LOCAL_MEM_FENCE);
-        if (item < half_items) {
-            const int other = local_best[item + half_items];
-            const int other_at = local_at[item + half_items];
-            if (other < local_best[item] || (other == local_best[item] && other_at < local_at[item])) {
-                local_best[item] = other;
-                local_at[item] = other_at;
-            }
-        }
-    }
+    keep_smallest(local_best, local_at, item, GROUP_ITEMS);
     if (item == 0) {
         const int tiles = (int)(get_num_groups(0) * get_num_groups(1));
         const int tile = (int)(get_group_id(1) * get_num_groups(0) + get_group_id(0));
@@ -635,6 +717,7 @@ ssd_search_best(
     __global int         *records,
     const int image_rows, const int image_columns,
     const int offset_rows, const int offset_columns,
+    const int map_columns,
     const int tiles)
 {
     const int index = (int)get_group_id(0);
@@ -654,43 +737,10 @@ ssd_search_best(
     __local int local_at[BEST_ITEMS];
     local_best[item] = smallest;
     local_at[item] = smallest_at;
-    for (int half_items = BEST_ITEMS / 2; half_items > 0; half_items /= 2) {
-        barrier(CLK_LOCAL_MEM_FENCE);
-        if (item < half_items) {
-            const int other = local_best[item + half_items];
-            const int other_at = local_at[item + half_items];
-            if (other < local_best[item] || (other == local_best[item] && other_at < local_at[item])) {
-                local_best[item] = other;
-                local_at[item] = other_at;
-            }
-        }
-    }
+    keep_smallest(local_best, local_at, item, BEST_ITEMS);
     barrier(CLK_LOCAL_MEM_FENCE);
     smallest_at = local_at[0];
 #endif
-
-    const int y = smallest_at / offset_columns;
-    const int x = smallest_at - y * offset_columns;
-    const int top = origins[2 * index] + y;
-    const int left = origins[2 * index + 1] + x;
-    __global int *record = records + index * RECORD;
-    if (item == 0) {
-        record[0] = top;
-        record[1] = left;
-        for (int ny = y - 1; ny <= y + 1; ++ny) {
-            for (int nx = x - 1; nx <= x + 1; ++nx) {
-                const int inside = ny >= 0 && ny < offset_rows && nx >= 0 && nx < offset_columns;
-                record[2 + 3 * (ny - y + 1) + nx - x + 1] =
-                    inside ? scores[(index * offset_rows + ny) * offset_columns + nx] : SCORE_NONE;
-            }
-        }
-    }
-#if PATCH_ROWS > 0
-    // Beyond the image's edge the patch repeats the last pixel.
-    for (int r = 0; r < PATCH_ROWS; ++r) {
-        __global const pixel *from = image + clamp(top - PATCH_MARGIN + r, 0, image_rows - 1) * image_columns;
-        for (int c = item; c < PATCH_COLUMNS; c += BEST_ITEMS)
-            record[11 + r * PATCH_COLUMNS + c] = as_int((float)from[clamp(left - PATCH_MARGIN + c, 0, image_columns - 1)]);
-    }
-#endif
+    write_record(records + index * RECORD, image, origins + 2 * index, scores + index * offset_rows * map_columns,
+                 smallest_at, image_rows, image_columns, offset_rows, offset_columns, map_columns, item, BEST_ITEMS);
 }

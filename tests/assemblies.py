@@ -83,7 +83,7 @@ class Rehearsal:
         self._state = [_shallow(vars(thing)) for thing in (assembly, *assembly.eyes)]
         for state, eye in zip(self._state[1:], assembly.eyes, strict=True):
             state["_templates"] = {part: eye.pipeline.templates(part) for part in PARTS}
-            state["_limits"] = {part: eye.pipeline._trackers[part].limits for part in PARTS}
+            state["_limits"] = {part: eye.pipeline._tracker(part).limits for part in PARTS}
 
     def wind_back(self) -> RunRecord:
         """Bring parts and assembly back to the moment kept, out of the hole first; returns a new record."""

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from adof_cl.cli import main
 from adof_cl.device import Device
 from adof_cl.image_files import read_image, read_stack, write_image
 from adof_cl.optics import OpticalSystem
+from adof_cl.otf import Otf1d
+from adof_cl.restore import Restore
 
 
 def run(*arguments: object) -> int:
@@ -96,6 +99,45 @@ def test_a_stack_is_restored_page_by_page_and_each_colour_by_itself(device: Devi
     write_image(tmp_path / "one.png", pages[1])
     assert run(tmp_path / "one.png", tmp_path / "one.tif", *options) == 0
     np.testing.assert_array_equal(read_image(tmp_path / "one.tif"), stack[1])
+
+
+@pytest.mark.parametrize("colours", [1, 3])
+def test_a_stack_is_to_the_last_bit_what_its_pages_are_one_at_a_time(
+    device: Device, tmp_path: Path, colours: int
+) -> None:
+    shape = (67, 81, 3) if colours == 3 else (67, 81)
+    pages = np.random.default_rng(4).integers(0, 65536, (7, *shape), dtype=np.uint16)
+    tifffile.imwrite(tmp_path / "in.tif", pages, photometric="rgb" if colours == 3 else "minisblack")
+    options = ("--alpha", 10, "--depth-um", 500, "--nsr", "0.01", "--white", 99, "--offset", 100)
+    assert run(tmp_path / "in.tif", tmp_path / "out.tif", *options, "--device", device.facts.index) == 0
+
+    optics = OpticalSystem()
+    psi = optics.psi_rad(500)
+    plan = Restore(device, shape[:2], padding=16 + math.ceil(optics.support_px(10, psi)))
+    axes = [Otf1d(device, optics.frequency_axis(n)).evaluate(10, psi) for n in plan.padded_shape]
+    plan.set_filter_axes(*axes, 0.01)
+    planes = pages.astype(np.float32).reshape(7, 67, 81, colours) - np.float32(100)
+    images = np.array(
+        [[plan.restore(np.ascontiguousarray(p[..., c])) for c in range(colours)] for p in planes]
+    )
+    images = np.moveaxis(images, 1, -1).reshape(pages.shape)
+    scale = 65535 / float(np.percentile(images[0], 99))
+    wanted = np.clip(np.floor(images * scale + 0.5), 0, 65535).astype(np.uint16)
+    np.testing.assert_array_equal(np.stack(list(read_stack(tmp_path / "out.tif"))), wanted)
+
+
+def test_a_page_of_another_kind_is_named_and_leaves_no_file(
+    device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with tifffile.TiffWriter(tmp_path / "in.tif") as writer:
+        for columns in (40, 40, 40, 41, 40):
+            writer.write(np.ones((32, columns), np.uint8), contiguous=False, metadata=None)
+    options = (*CODED, "--device", device.facts.index)
+    assert run(tmp_path / "in.tif", tmp_path / "out.tif", *options) == 2
+    said = capsys.readouterr()
+    assert "page 4 is (32, 41) uint8" in said.err
+    assert not said.out
+    assert [path.name for path in tmp_path.iterdir()] == ["in.tif"]
 
 
 def test_the_hand_in_a_real_diffuser_capture_comes_out(

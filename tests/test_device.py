@@ -12,11 +12,14 @@ from hypothesis import strategies as st
 
 from adof_cl.device import Device, DeviceFacts, choose, list_devices
 from adof_cl.errors import DeviceError, InputError
+from adof_cl.program import Program
+
+_ADD = "__kernel void add(__global int *values) { values[get_global_id(0)] += 1; }\n"
 
 
 def facts(index: int, name: str, platform: str, kind: str, *, simulated: bool = False) -> DeviceFacts:
     return DeviceFacts(
-        index, name, platform, kind, "OpenCL 3.0", "1", True, 2, 32768, 1 << 30, 1 << 28, 256, 64, simulated
+        index, name, platform, kind, "OpenCL 3.0", "1", True, 2, 32768, 2**30, 2**28, 256, 64, 0, simulated
     )
 
 
@@ -90,11 +93,74 @@ def test_what_is_uploaded_comes_back(device: Device) -> None:
     assert np.array_equal(device.upload(values).download(), values)
 
 
+@pytest.mark.parametrize("shape", [(7, 13), (301, 403)], ids=["small", "large"])
+@pytest.mark.parametrize("copies_apart", [False, True])
+def test_a_copy_in_two_halves_is_the_one_begun_whatever_is_uploaded_since(
+    device: Device, shape: tuple[int, int], copies_apart: bool
+) -> None:
+    opened = Device(device.facts, device.handle, copies_apart=copies_apart)
+    array = opened.empty(shape, np.float32)
+    assert not array.arrived
+    with pytest.raises(InputError, match="nothing was staged"):
+        array.send()
+    first, second, third = np.random.default_rng(1).normal(size=(3, *shape)).astype(np.float32)
+    staged = second.copy()
+    array.stage(first)
+    array.stage(staged)
+    staged[:] = 0  # the host's own again
+    array.send().begin_download()
+    opened.wait()
+    assert array.arrived
+    array.upload(third)
+    assert np.array_equal(array.download(), second)
+    assert not array.arrived
+    out = np.empty(shape, np.float32)
+    assert array.download(out) is out
+    assert np.array_equal(out, third)
+
+
+@pytest.mark.parametrize("shares", [True, False])
+def test_a_shared_array_holds_what_kernels_wrote_and_keeps_what_came_before(
+    device: Device, monkeypatch: pytest.MonkeyPatch, shares: bool
+) -> None:
+    monkeypatch.setattr(device, "_shares_memory", shares and device._shares_memory)
+    array = device.shared((1000,), np.int32)
+    add = Program(device, "precision.h", generated=("add.cl", _ADD)).launch("add", (1000,), (1,), array)
+    array.upload(np.arange(1000, dtype=np.int32))
+    earlier = []
+    for _ in range(3):
+        add()
+        earlier.append(array.download())
+    add()
+    array.begin_download()
+    device.wait()
+    assert array.arrived
+    earlier.append(array.download())
+    assert not array.arrived
+    for n, values in enumerate(earlier):
+        assert np.array_equal(values, np.arange(1000) + n + 1)
+
+
+@pytest.mark.parametrize("shape", [(2, 3), (301, 403)], ids=["small", "large"])
+def test_what_was_uploaded_is_the_hosts_own_again(device: Device, shape: tuple[int, int]) -> None:
+    array = device.empty(shape, np.int32)
+    values = np.empty(shape, np.int32)
+    found = []
+    for k in range(20):
+        values[:] = k
+        array.upload(values)
+        values[:] = -1
+        found.append(array.download())
+    for k, seen in enumerate(found):
+        assert (seen == k).all()
+
+
 def test_an_array_of_another_shape_or_type_is_refused_and_nothing_changed(device: Device) -> None:
     array = device.upload(np.arange(6, dtype=np.float32).reshape(2, 3))
     for wrong in (np.zeros((3, 2), np.float32), np.zeros((2, 3), np.float64)):
-        with pytest.raises(InputError, match="was wanted"):
-            array.upload(wrong)
+        for refused in (array.upload, array.stage):
+            with pytest.raises(InputError, match="was wanted"):
+                refused(wrong)
     with pytest.raises(InputError, match="out is"):
         array.download(np.zeros((2, 3), np.float64))
     assert np.array_equal(array.download(), np.arange(6, dtype=np.float32).reshape(2, 3))

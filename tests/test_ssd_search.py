@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import tolerances
-from adof_cl import reference
+from adof_cl import reference, ssd_search
 from adof_cl.device import Device
 from adof_cl.errors import DeviceError, InputError, TrackingError
 from adof_cl.ssd_search import LARGEST_TEMPLATE, SsdSearch
@@ -369,12 +369,52 @@ def test_templates_without_contrast_or_not_finite_are_refused(device: Device) ->
         plan.set_template(0, np.full((7, 5), np.nan, np.float32))
 
 
-@pytest.mark.parametrize("vector_bytes", [4, 32])
-def test_bytes_are_exact_with_vectors_of_four_and_eight_lanes(
+@pytest.mark.parametrize("vector_bytes", [16, 32, 64])
+def test_bytes_are_exact_with_vectors_of_every_width(
     device: Device, monkeypatch: pytest.MonkeyPatch, vector_bytes: int
 ) -> None:
-    monkeypatch.setattr(device, "facts", replace(device.facts, vector_bytes=vector_bytes))
+    monkeypatch.setattr(device, "vector_bytes", vector_bytes)
     check_bytes(device, "lanes", (5, 3), picture(3, (83, 141), "uint8"), 7)
+
+
+@pytest.mark.parametrize("columns", [2, 9, 10, 17, 40])
+def test_bytes_are_exact_in_windows_narrower_and_wider_than_a_vector(device: Device, columns: int) -> None:
+    image = picture(3, (12, columns), "uint8")
+    plan = SsdSearch(device, image.shape, (4, 2), image.shape, 1, family="lanes")
+    template = cut(image, (3, columns - 2), (4, 2))
+    plan.set_templates(template[None])
+    found = plan.search(image)
+    best, scores = reference.ssd_search(image, template, (0, 0), image.shape)
+    np.testing.assert_array_equal(plan.score_maps()[0], scores)
+    assert tuple(found.best_yx[0]) == best
+
+
+@pytest.mark.parametrize("score", ["ssd", "gain_offset"])
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
+def test_however_a_window_is_cut_into_tiles_the_answer_is_the_same(
+    device: Device, monkeypatch: pytest.MonkeyPatch, dtype: str, score: str
+) -> None:
+    image = np.tile(picture(71, (20, 50), dtype), (2, 3))  # every place but the last rows' and columns' twice
+    answers = []
+    for most in (2**20, 1):
+        monkeypatch.setattr(ssd_search, "_TILE_TAPS", most)
+        plan = SsdSearch(
+            device,
+            image.shape,
+            (5, 3),
+            (36, 140),
+            2,
+            dtype=dtype,
+            score=score,
+            family="lanes",
+            patch_margin=1,
+        )
+        plan.set_templates(np.stack([cut(image, (y, x), (5, 3)) for y, x in ((13, 41), (17, 3))]))
+        plan.set_windows([(2, 5), (4, 10)])
+        found = plan.search(image)
+        answers.append((found.best_yx, found.neighbourhood, found.patches, plan.score_maps()))
+    for one, many in zip(*answers, strict=True):
+        np.testing.assert_array_equal(one, many)
 
 
 def test_a_device_with_too_little_local_memory_is_refused_in_words(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -75,6 +76,7 @@ def restore(
     Example: adof restore raw.tif hand.tif --psf psf.tif
     """
     import time
+    from itertools import islice
 
     import numpy as np
     from rich.console import Console
@@ -84,6 +86,7 @@ def restore(
     from adof_cl.errors import InputError
     from adof_cl.image_files import open_writer, read_stack
     from adof_cl.optics import Mask, OpticalSystem
+    from adof_cl.stream import RestoredFrames, Stream
 
     if (psf is None) == (alpha is None):
         raise InputError("the blur is unknown: give either --alpha and --depth-um, or --psf")
@@ -117,8 +120,11 @@ def restore(
             job = _computed(opened, stack, optics, mask, depth_um, level, noise, precision)
         progress.update(task, description="restoring")
         scale = 0.0
-        for page in stack:
-            restored = job.restored(page)
+        # The next page is read, and the one before written, while the device restores.
+        planes = Stream(RestoredFrames(job.plan)).run(job.planes(stack))
+        colours = 1 if len(stack.shape) == 2 else stack.shape[2]
+        while page := [result.values[0] for result in islice(planes, colours)]:
+            restored = page[0] if len(stack.shape) == 2 else np.stack(page, axis=-1)
             if not scale:
                 top = float(np.percentile(restored, percentile)) if percentile else 0.0
                 scale = np.iinfo(stack.dtype).max / top if top > 0 else 1.0
@@ -133,20 +139,17 @@ def restore(
 
 @dataclass(frozen=True)
 class _Job:
-    """A plan with its filter set, and what is done to a page before it."""
+    """A plan with its filter set, and what is done to a page before it is restored."""
 
     plan: Restore
     offset: float
     repair: bool
     noise: str
 
-    def restored(self, page: Image) -> NDArray[np.float32]:
-        import numpy as np
-
-        values = _light(page, self.offset, self.repair)
-        planes = [values] if values.ndim == 2 else [values[..., c] for c in range(values.shape[2])]
-        images = [self.plan.restore(np.ascontiguousarray(plane)) for plane in planes]
-        return images[0] if values.ndim == 2 else np.stack(images, axis=-1)
+    def planes(self, stack: ImageStack) -> Iterator[NDArray[np.float32]]:
+        for page in stack:
+            values = _light(page, self.offset, self.repair)
+            yield from [values] if values.ndim == 2 else [values[..., c] for c in range(values.shape[2])]
 
 
 def _measured(
