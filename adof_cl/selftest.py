@@ -195,7 +195,7 @@ def check_otf(device: Device, size: Size, precision: str) -> Iterator[Outcome]:
     chosen = [listed[i % len(listed)] for i in range(pairs)]
     scattered = np.concatenate([[0.0, 2.0, -2.0, 2.5, 1e-4], np.random.default_rng(3).uniform(-2, 2, n - 5)])
     every_seventh = np.where(np.arange(n) % 7 == 3, 0.0, np.sinc(scattered / 5))
-    axes = 3.6 * np.concatenate([np.fft.fftfreq(n - 1), np.fft.fftfreq(n)])
+    axes = 3.6 * np.concatenate([np.fft.fftfreq(n - 1), np.fft.fftfreq(2 * n - 1)])
     imaginary = np.where(axes == -1.8, 0.0, 1.0)  # none at Nyquist
     # Terms of at most 3.5 in all, each with some ten roundings, seldom of one sign.
     bound = 3e-6 if precision == "float32" else 1e-12

@@ -46,7 +46,7 @@
 typedef struct { two_term alpha, psi; } otf_pair;
 typedef struct { otf_pair row[OTF_PAIRS]; } otf_pairs;
 
-// For w = |u| up to 2 and b = 1 - w/2. COARSE and FINE: a number's leading half of bits, and the rest.
+// For w = |u| up to 2 and b = 1 - w/2. NAME and NAME_FINE: the leading half of a number's bits, and the rest.
 enum {
     END, END_FINE,       // 1 - (1 - w)^3: phi+ and phi- over alpha
     RUN, RUN_FINE,       // 1 - (1 - w)^2 = 2 w b: phi+ over psi
