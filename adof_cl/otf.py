@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,35 +14,47 @@ from scipy.interpolate import CubicSpline
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError, LimitError
 from adof_cl.optics import OpticalSystem, PupilGrid, require_finite
-from adof_cl.phase_terms import require_envelope, split, split_turns, wrapped_turns
-from adof_cl.program import Program
+from adof_cl.phase_terms import ALPHA_LIMIT_RAD, PSI_LIMIT_RAD, require_envelope, wrapped_turns
+from adof_cl.program import Launch, Program, vector_bytes
+
+FAMILIES = ("lanes", "groups")
 
 _GROUP = 64
+_ITEMS_PER_UNIT = 4  # so that no core waits long for the last
+_PAIR_BYTES = 896  # by value: with the other arguments within the 1024 that every device takes
+_LIMITS_RAD = np.array([ALPHA_LIMIT_RAD, PSI_LIMIT_RAD])
 
 
 class Otf1d:
     """Form H(u; alpha, psi) of the square stop for fixed frequencies, on the device.
 
-    Built once: compiles, uploads the frequencies, allocates the result. Called often: sets a few numbers and
-    enqueues; never waits and copies nothing.
+    Built once: compiles, uploads what depends on the frequencies, allocates the result. Called often: one
+    launch for 56 pairs (28 in float64); never waits and copies nothing.
+
+    Of a run of frequencies that is a transform's axis (0, then both signs of the others, as
+    `numpy.fft.fftfreq` has them) half is evaluated; the rest is its mirror image, H(-u) = conj H(u), and
+    H(0) = 1 is written when the plan is built.
 
     Parameters
     ----------
     device
         The opened device.
     u : (n,)
-        Normalised frequencies, both signs; H is 0 beyond |u| = 2.
+        Normalised frequencies, both signs, of one axis or of several; H is 0 beyond |u| = 2.
     gain : (n, 2) or (n,), optional
         Factors of the real and the imaginary part (one column: of both), such as a pixel's transfer.
     pairs
         How many (alpha, psi) one call forms: rows of the result.
     precision
         "float32" or "float64".
+    family
+        "lanes": as many frequencies at once as a vector holds. "groups": one frequency to a work-item.
+        By default lanes on a CPU, groups elsewhere.
 
     Raises
     ------
     InputError
-        `u` or `gain` is not finite or not of that shape.
+        `u` or `gain` is not finite or not of that shape, or there is no such family.
     DeviceError
         The device lacks the precision.
 
@@ -59,6 +72,7 @@ class Otf1d:
         gain: NDArray[np.float64] | None = None,
         pairs: int = 1,
         precision: str = "float32",
+        family: str | None = None,
     ) -> None:
         self.u = np.array(u, dtype=np.float64)
         if self.u.ndim != 1 or not self.u.size:
@@ -73,28 +87,49 @@ class Otf1d:
             raise InputError(f"gain has shape {factors.shape}: ({n}, 2) or ({n},) was wanted")
         if not (np.isfinite(self.u).all() and np.isfinite(factors).all()):
             raise InputError("u or gain holds NaN or infinity: finite numbers were wanted")
+        self.family = family or ("lanes" if device.facts.kind == "cpu" else "groups")
+        if self.family not in FAMILIES:
+            raise InputError(f"family is '{family}': choose 'lanes' or 'groups'")
         self._real = device.real_type(precision)
-        self.out = device.empty((pairs, n), np.result_type(self._real, np.complex64))
-        self._pairs = np.zeros((pairs, 2))
-        frequencies = device.upload(split(self.u, self._real))
-        gains = device.upload(factors.astype(self._real))
-        program = Program(device, "otf.cl", {"REAL_IS_DOUBLE": precision == "float64"})
-        group = min(_GROUP, device.facts.max_work_group_size)
-        numbers = [self._real.type(0)] * 7
-        self._launches = [
-            program.launch(
-                "otf_1d",
-                (-(-n // group) * group,),
-                (group,),
-                frequencies,
-                gains,
-                self.out,
-                np.int32(n),
-                np.int32(row),
-                *numbers,
+        self._pairs_shape = (pairs, 2)
+
+        width = vector_bytes(device) if self.family == "lanes" else 0
+        places, members = _blocks(self.u, factors, max(width // self._real.itemsize, 1))
+        terms, least = _terms(self.u, factors, members, self._real)
+        blocks = len(places)
+        at_once = np.zeros((pairs, n), np.result_type(self._real, np.complex64))
+        at_once[:] = np.where(self.u == 0, factors[:, 0], 0)
+        self.out = device.upload(at_once)
+
+        # Pairs go by value, `most` to a launch: pair; alpha, psi; hi, lo.
+        most = _PAIR_BYTES // (4 * self._real.itemsize)
+        self._turns = np.zeros((-(-pairs // most) * most, 2, 2), self._real)
+        self._launches: list[Launch] = []
+        if not blocks:  # nothing but H(0)
+            return
+        program = Program(
+            device,
+            "otf.cl",
+            {"REAL_IS_DOUBLE": precision == "float64", "VECTOR_BYTES": width, "OTF_PAIRS": most},
+        )
+        shared = [device.upload(array) for array in (terms, places, least)]
+        for first in range(0, pairs, most):
+            rows = min(most, pairs - first)
+            each, group = 1, min(_GROUP, device.facts.max_work_group_size)
+            if width:
+                items = _ITEMS_PER_UNIT * device.facts.compute_units
+                each, group = min(-(-blocks * rows // items), blocks), 1
+            self._launches.append(
+                program.launch(
+                    "otf_1d",
+                    (-(-blocks // (each * group)) * group, rows),
+                    (group, 1),
+                    *shared,
+                    self.out,
+                    *(np.int32(number) for number in (n, blocks, each, first)),
+                    self._argument(len(self._launches)),
+                )
             )
-            for row in range(pairs)
-        ]
 
     @classmethod
     def for_camera(
@@ -110,10 +145,40 @@ class Otf1d:
 
         The Nyquist bin of an even length is real, so that a real image stays real.
         """
-        gain = np.repeat(optics.pixel_otf_axis(samples)[:, None], 2, axis=1)
-        if samples % 2 == 0:
-            gain[samples // 2, 1] = 0.0
-        return cls(device, optics.frequency_axis(samples), gain=gain, pairs=pairs, precision=precision)
+        return cls.for_frame(device, optics, (samples,), pairs=pairs, precision=precision)
+
+    @classmethod
+    def for_frame(
+        cls,
+        device: Device,
+        optics: OpticalSystem,
+        shape: Sequence[int],
+        *,
+        pixel: bool = True,
+        pairs: int = 1,
+        precision: str = "float32",
+    ) -> Otf1d:
+        """Form the transfer along each axis of a camera frame, one axis after the other, each DC first.
+
+        Parameters
+        ----------
+        shape
+            Samples of each axis.
+        pixel
+            Whether the pixel's aperture is included.
+
+        The Nyquist bin of an even length is real, so that a real image stays real.
+        """
+        gains = []
+        for samples in shape:
+            gain = np.repeat(
+                (optics.pixel_otf_axis(samples) if pixel else np.ones(samples))[:, None], 2, axis=1
+            )
+            if samples % 2 == 0:
+                gain[samples // 2, 1] = 0.0
+            gains.append(gain)
+        u = np.concatenate([optics.frequency_axis(samples) for samples in shape])
+        return cls(device, u, gain=np.concatenate(gains), pairs=pairs, precision=precision)
 
     def __call__(self, pairs: Sequence[tuple[float, float]] | NDArray[np.float64]) -> DeviceArray:
         """Enqueue the transfer functions of `pairs` of (alpha_rad, psi_rad); return `self.out`.
@@ -134,16 +199,25 @@ class Otf1d:
             Not that many, not finite, or beyond the limits.
         """
         wanted = np.asarray(pairs, dtype=np.float64)
-        if wanted.shape != self._pairs.shape:
+        if wanted.shape != self._pairs_shape:
             raise InputError(
-                f"pairs has shape {wanted.shape}: {self._pairs.shape} of (alpha, psi) was wanted, as planned"
+                f"pairs has shape {wanted.shape}: {self._pairs_shape} of (alpha, psi) was wanted, as planned"
             )
-        checked = [require_envelope(float(alpha), float(psi)) for alpha, psi in wanted]
-        for launch, (alpha, psi) in zip(self._launches, checked, strict=True):
-            for index, value in enumerate(self._numbers(alpha, psi), start=5):
-                launch.set(index, value)
+        if not (np.abs(wanted) <= _LIMITS_RAD).all():
+            for alpha, psi in wanted:
+                require_envelope(float(alpha), float(psi))
+        turns = wanted * (1 / (2 * math.pi))
+        hi, lo = self._turns[: len(turns), :, 0], self._turns[: len(turns), :, 1]
+        hi[...] = turns
+        np.subtract(turns, hi, out=lo, casting="same_kind")
+        for index, launch in enumerate(self._launches):
+            launch.set(8, self._argument(index))
             launch()
         return self.out
+
+    def _argument(self, launch: int) -> np.void:
+        most = _PAIR_BYTES // (4 * self._real.itemsize)
+        return np.void(self._turns[launch * most : (launch + 1) * most].tobytes())
 
     def evaluate(self, alpha_rad: float, psi_rad: float) -> NDArray[np.complexfloating[Any, Any]]:
         """Return H at `self.u` on the host; for plans of one pair.
@@ -156,11 +230,66 @@ class Otf1d:
         values: NDArray[np.complexfloating[Any, Any]] = self([(alpha_rad, psi_rad)]).download()[0]
         return values
 
-    def _numbers(self, alpha: float, psi: float) -> list[np.floating[Any]]:
-        # The stationary point lies outside the stop otherwise, and the kernel never looks.
-        shift = psi**2 / (3 * abs(alpha)) if abs(psi) < 3 * abs(alpha) else 0.0
-        numbers = [part for value in (abs(alpha), abs(psi), shift) for part in split_turns(value, self._real)]
-        return [*numbers, self._real.type(math.copysign(1.0, alpha))]
+
+def _blocks(
+    u: NDArray[np.float64], gain: NDArray[np.float64], lanes: int
+) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
+    """Cut frequencies into blocks of `lanes`, leaving out what is a mirror image.
+
+    Returns
+    -------
+    places : (blocks, 4)
+        Where a block's first goes, where that one's mirror image goes (-1: none), how many it holds, 0.
+    members : (blocks, lanes)
+        Which frequency each lane has; lanes to spare repeat the last.
+    """
+    places, members = [], []
+    for start, stop in pairwise(np.unique([0, *np.flatnonzero(u == 0), u.size]).tolist()):
+        mirrored = _is_transform_axis(u[start:stop], gain[start:stop])
+        first, last = (start + 1, (start + stop) // 2 + 1) if mirrored else (start, stop)
+        for i in range(first, last, lanes):
+            places.append((i, start + stop - i if mirrored else -1, min(lanes, last - i), 0))
+            members.append(np.minimum(np.arange(i, i + lanes), last - 1))
+    return np.array(places, np.int32).reshape(-1, 4), np.array(members, np.intp).reshape(-1, lanes)
+
+
+def _is_transform_axis(u: NDArray[np.float64], gain: NDArray[np.float64]) -> bool:
+    """Whether u is 0, then frequencies whose negatives follow in reverse, each with the same gain."""
+    upper = np.arange(1, (u.size + 1) // 2)
+    lower = u.size - upper
+    return bool(u[0] == 0 and (u[upper] == -u[lower]).all() and (gain[upper] == gain[lower]).all())
+
+
+def _terms(
+    u: NDArray[np.float64], gain: NDArray[np.float64], members: NDArray[np.intp], real: np.dtype[Any]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return what the kernel needs of each frequency, and `least` of each block: see kernels/otf.cl."""
+    w = np.minimum(np.abs(u), 2.0)
+    b = 1 - w / 2
+    root = np.sqrt(w)
+    # Below, the phase of every mask is short, and the kernel does not look.
+    over_root = np.divide(1, root, out=np.zeros_like(w), where=w > 1e-9)
+    run, slope = w * (2 - w), 6 * w * b
+    inside = np.abs(u) < 2
+    phases = [half for value in (w * (3 - w * (3 - w)), run, w**3 / 4, w) for half in _halves(value, real)]
+    gains = [gain[:, 0] * inside, gain[:, 1] * inside * np.sign(u)]
+    terms = np.stack([*phases, 2 * w, slope, b, root, over_root, *gains]).astype(real)[:, members]
+    lanes = members.shape[1]
+    terms = terms.transpose(1, 0, 2) if lanes > 1 else terms[..., 0]
+    least = np.stack(
+        [run[members].min(axis=1, initial=2), (slope * b)[members].min(axis=1, initial=2)], axis=1
+    )
+    return np.ascontiguousarray(terms), least.astype(real)
+
+
+def _halves(
+    values: NDArray[np.float64], real: np.dtype[Any]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Split values into a part with half of a real's bits and the rest (docs/maths.md, eq. P3)."""
+    bits = (np.finfo(real).nmant + 1) // 2
+    mantissa, exponent = np.frexp(values)
+    coarse = np.ldexp(np.rint(np.ldexp(mantissa, bits)), exponent - bits)
+    return coarse, values - coarse
 
 
 def stationary_phase_otf(

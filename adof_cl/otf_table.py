@@ -21,31 +21,32 @@ from adof_cl.otf import Otf1d
 class OtfTable:
     """Transfer functions along a camera's rows and columns for several (alpha, psi) at once.
 
-    Built once; `update` enqueues and never waits.
+    Built once; `update` is one launch (one more for each further 56 entries, 28 in float64) and never waits.
 
     Parameters
     ----------
     device
         The opened device.
     optics
-        The camera's optics; its pixel aperture is included.
+        The camera's optics.
     shape
         Samples (rows, columns), padding included: `Restore.padded_shape`.
     entries
         How many (alpha, psi) the table holds.
+    pixel
+        Whether the pixel's aperture is included.
     precision
         "float32" or "float64".
 
     Attributes
     ----------
-    otf_y : (entries, rows) complex
-        Along the columns' direction, on the device.
-    otf_x : (entries, columns) complex
-        Along the rows' direction, on the device.
+    out : (entries, rows + columns) complex
+        On the device: first along the rows' index, then along the columns', each DC first. The Nyquist bin of
+        an even length is real, so that a real image stays real.
 
     Source
     ------
-    docs/maths.md, eq. O4; 2-D: `otf[v, u] = otf_y[v] otf_x[u]`.
+    docs/maths.md, eq. O4; 2-D: `otf[v, u] = out[v] out[rows + u]`.
     """
 
     def __init__(
@@ -55,20 +56,14 @@ class OtfTable:
         shape: tuple[int, int],
         *,
         entries: int = 1,
+        pixel: bool = True,
         precision: str = "float32",
     ) -> None:
-        rows, columns = shape
         self.optics = optics
         self.shape = shape
         self.entries = entries
-        self._plan_y = Otf1d.for_camera(device, optics, rows, pairs=entries, precision=precision)
-        self._plan_x = (
-            self._plan_y
-            if rows == columns
-            else Otf1d.for_camera(device, optics, columns, pairs=entries, precision=precision)
-        )
-        self.otf_y: DeviceArray = self._plan_y.out
-        self.otf_x: DeviceArray = self._plan_x.out
+        self._plan = Otf1d.for_frame(device, optics, shape, pixel=pixel, pairs=entries, precision=precision)
+        self.out: DeviceArray = self._plan.out
 
     def update(self, pairs: Sequence[tuple[float, float]] | NDArray[np.float64]) -> None:
         """Enqueue the whole table for `pairs` of (alpha_rad, psi_rad), (entries, 2).
@@ -78,9 +73,7 @@ class OtfTable:
         InputError, LimitError
             Not that many, not finite, or beyond the measured range.
         """
-        self._plan_y(pairs)
-        if self._plan_x is not self._plan_y:
-            self._plan_x(pairs)
+        self._plan(pairs)
 
     def update_depths(self, mask: Mask, depths_um: Sequence[float]) -> None:
         """Enqueue the table for objects at `depths_um` (entries) seen through `mask`.
@@ -92,8 +85,8 @@ class OtfTable:
         """
         self.update([(mask.alpha_rad, mask.psi_rad(self.optics, depth)) for depth in depths_um])
 
-    def otf(self, entry: int) -> NDArray[np.complexfloating[Any, Any]]:
-        """Return one entry's two-dimensional transfer function on the host, `shape` complex, DC first.
+    def axes(self, entry: int) -> tuple[NDArray[np.complexfloating[Any, Any]], ...]:
+        """Return one entry's (rows) and (columns) transfer functions on the host.
 
         Raises
         ------
@@ -102,6 +95,15 @@ class OtfTable:
         """
         if not 0 <= entry < self.entries:
             raise InputError(f"entry is {entry}: 0 to {self.entries - 1} was wanted")
-        otf_y = self.otf_y.download()[entry]
-        otf_x = self.otf_x.download()[entry]
-        return np.asarray(np.outer(otf_y, otf_x))
+        line = self.out.download()[entry]
+        return line[: self.shape[0]], line[self.shape[0] :]
+
+    def otf(self, entry: int) -> NDArray[np.complexfloating[Any, Any]]:
+        """Return one entry's two-dimensional transfer function on the host, `shape` complex, DC first.
+
+        Raises
+        ------
+        InputError
+            No such entry.
+        """
+        return np.asarray(np.outer(*self.axes(entry)))

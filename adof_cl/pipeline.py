@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError, TrackingError
 from adof_cl.optics import Mask, OpticalSystem, require_finite
-from adof_cl.otf import Otf1d
+from adof_cl.otf_table import OtfTable
 from adof_cl.phase_terms import require_envelope
 from adof_cl.restore import Restore
 from adof_cl.tracking import Measurement, Template, TemplateTracker, TrackingLimits
@@ -134,8 +134,9 @@ class CameraPipeline:
         self._search_shape = search_shape
         self._restore = Restore(device, shape, in_dtype=np.uint8, out_dtype=np.uint8, padding=padding)
         # The pixel's own transfer stays in the image, as it is in the templates.
-        axes = np.concatenate([optics.frequency_axis(n) for n in self._restore.padded_shape])
-        self._otf = {part: Otf1d(device, axes) for part in self.parts}
+        self._otf = {
+            part: OtfTable(device, optics, self._restore.padded_shape, pixel=False) for part in self.parts
+        }
         self._buffers = [
             _Buffer(
                 device.empty(shape, np.uint8), {part: device.empty(shape, np.uint8) for part in self.parts}
@@ -283,8 +284,9 @@ class CameraPipeline:
                 continue
             slot = self.parts.index(part)
             if not blur.near(self._blurs.get(part)):
-                table = self._otf[part]([(blur.alpha_rad, blur.psi_rad)])
-                self._restore.set_filter_table(table, self.nsr, slot)
+                table = self._otf[part]
+                table.update([(blur.alpha_rad, blur.psi_rad)])
+                self._restore.set_filter_table(table.out, self.nsr, slot)
                 self._blurs[part] = blur
             self._restore.apply(place.images[part], slot)
 

@@ -29,6 +29,9 @@ CACHE_VARIABLE = "ADOF_CACHE_DIR"
 _MAGIC = b"adof-cl program 1\n"
 _INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]+"([^"]+)"[^\n]*$', re.MULTILINE)
 
+# Kept alive: a simulator forgets what was written where an address is used again, and constants have some.
+_simulated: list[cl.Program] = []
+
 Argument = DeviceArray | np.generic | None
 """What a kernel takes: an array on the device, a NumPy scalar of the exact type, or None for no buffer."""
 
@@ -111,8 +114,11 @@ class Launch:
 
     def _pass(self, index: int, argument: Argument) -> None:
         self._arguments[index] = argument
-        value = argument.buffer if isinstance(argument, DeviceArray) else argument
-        self._kernel.set_arg(index, value)
+        if isinstance(argument, np.generic):
+            # The public way tries everything else that a number could be first: 10 us instead of 0.1.
+            self._kernel._set_arg_buf(index, argument)  # type: ignore[attr-defined]  # noqa: SLF001
+        else:
+            self._kernel.set_arg(index, None if argument is None else argument.buffer)
 
     def update(self, arguments: Mapping[int, Argument]) -> None:
         """Replace several arguments, by index, from the next call on."""
@@ -174,6 +180,8 @@ class Program:
         ]
         self._name = source
         self._program = self._cached_or_built()
+        if device.facts.simulated:
+            _simulated.append(self._program)
 
     def launch(
         self,

@@ -10,6 +10,7 @@ the inner one once.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -462,7 +463,9 @@ class Restore:
             self._form.update({0: table, 1: table, 2: nsr, 5: stored, 8: rows_from, 9: cols_from})
             self._form()
             return
-        level = float(checked_nsr(float(nsr), (ny, nx // 2 + 1)))
+        level = float(nsr)
+        if not 0 <= level < math.inf:
+            checked_nsr(level, (ny, nx // 2 + 1))  # says what is wrong
         kept = self._filters.setdefault(slot, _Filter())
         if kept.long_axis is None or kept.short_axis is None:
             kept.long_axis = self.device.empty((self._longs, 2), self._real)
@@ -563,7 +566,7 @@ class Restore:
         if not self._transformed:
             raise InputError("no frame has been transformed since the last restoration: call transform first")
         if self._filtered is None:
-            self._filtered = self.device.empty(self._spectrum.shape, self._real)
+            self._filtered = self.device.empty(self._spectrum.shape, self._spectrum.dtype)
         self._set_end(self._filtered, out, slot)
         self._steps.run(1, 3)
         return out

@@ -23,6 +23,7 @@ from adof_cl.device import Device
 from adof_cl.errors import AdofError
 from adof_cl.image_prep import ImagePrep, Region
 from adof_cl.optics import Mask, OpticalSystem, PupilGrid, SlmPanel
+from adof_cl.otf import FAMILIES as OTF_FAMILIES
 from adof_cl.otf import Otf1d, SeparableMaskOtf
 from adof_cl.program import Program
 from adof_cl.psf import Psf, stop_amplitude
@@ -180,10 +181,10 @@ def check_slm_encode(device: Device, size: Size, precision: str) -> Iterator[Out
 
 
 def check_otf(device: Device, size: Size, precision: str) -> Iterator[Outcome]:
-    """The exact form in every branch of eq. O4, then another profile by transforms."""
+    """The exact form in every branch of eq. O4 and in both families; another profile by transforms."""
     pairs, n = size
     listed = [
-        (53.5, 15.0),
+        (53.5, 75.0),
         (0.0, 0.0),
         (0.0, -20.0),
         (1e-3, 5.0),
@@ -192,15 +193,23 @@ def check_otf(device: Device, size: Size, precision: str) -> Iterator[Outcome]:
         (-30.0, 120.0),
     ]
     chosen = [listed[i % len(listed)] for i in range(pairs)]
-    u = np.concatenate([[0.0, 2.0, -2.0, 2.5, 1e-4], np.random.default_rng(3).uniform(-2, 2, n - 5)])
-    gain = np.stack([np.sinc(u / 5), np.where(np.arange(n) % 7 == 3, 0.0, np.sinc(u / 5))], axis=1)
-    plan = Otf1d(device, u, gain=gain, pairs=pairs, precision=precision)
-    found = plan(chosen).download()
-    exact = np.stack([reference.otf_1d(u, alpha, psi) for alpha, psi in chosen])
-    wanted = exact.real * gain[:, 0] + 1j * exact.imag * gain[:, 1]
+    scattered = np.concatenate([[0.0, 2.0, -2.0, 2.5, 1e-4], np.random.default_rng(3).uniform(-2, 2, n - 5)])
+    every_seventh = np.where(np.arange(n) % 7 == 3, 0.0, np.sinc(scattered / 5))
+    axes = 3.6 * np.concatenate([np.fft.fftfreq(n - 1), np.fft.fftfreq(2 * n - 1)])
+    imaginary = np.where(axes == -1.8, 0.0, 1.0)  # none at Nyquist
     # Terms of at most 3.5 in all, each with some ten roundings, seldom of one sign.
     bound = 3e-6 if precision == "float32" else 1e-12
-    yield Outcome(f"otf exact, {_at(size, precision)}", ("otf_1d",), "|dH|", _largest(found - wanted), bound)
+    for form, u, gain in (
+        ("", scattered, np.stack([np.sinc(scattered / 5), every_seventh], axis=1)),
+        ("two axes, ", axes, np.stack([np.ones(axes.size), imaginary], axis=1)),
+    ):
+        exact = np.stack([reference.otf_1d(u, alpha, psi) for alpha, psi in chosen])
+        wanted = exact.real * gain[:, 0] + 1j * exact.imag * gain[:, 1]
+        for family in OTF_FAMILIES:
+            plan = Otf1d(device, u, gain=gain, pairs=pairs, precision=precision, family=family)
+            apart = _largest(plan(chosen).download() - wanted)
+            name = f"otf exact, {form}{family}, {_at(size, precision)}"
+            yield Outcome(name, ("otf_1d",), "|dH|", apart, bound)
 
     samples = 1 << (n.bit_length() - 1)
     profile = PupilGrid(samples)

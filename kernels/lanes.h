@@ -4,6 +4,7 @@
 //                  does one problem
 //   vec            that many bytes of reals;   LANES how many;   SCALAR their type's name
 //   JOIN(A, B)     joins two names after expanding them: JOIN(uchar, LANES)
+//   cvec           complex numbers, one in each lane
 //   CONVERT(V, T)  a vector to elements of type T
 //   ALWAYS_INLINE  for helpers: a plain `inline` becomes a call through memory on some compilers
 //   WIDE           for kernels: without it LLVM halves vectors of 64 bytes even where the registers hold them
@@ -55,6 +56,8 @@ typedef real vec;
 #if VECTOR_BYTES
 typedef JOIN(SCALAR, LANES) vec;
 #endif
+
+typedef struct { vec re, im; } cvec;
 
 // OpenCL's convert_ functions are calls on some compilers, a vector conversion is one instruction.
 #if VECTOR_BYTES == 0

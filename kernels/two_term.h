@@ -48,6 +48,13 @@ static inline two_term two_term_scale(const two_term a, const real exact)
     return (two_term)(a.x * exact, a.y * exact);
 }
 
+static inline two_term two_term_div(const two_term a, const two_term b)
+{
+    const real q = a.x / b.x;
+    const two_term rest = two_term_add(a, two_term_scale(two_term_mul(b, (two_term)(q, 0)), -1));
+    return two_term_ordered(q, rest.x / b.x);
+}
+
 // The part of `turns` beyond whole turns, in [-1/2, 1/2] up to rounding.
 static inline real two_term_fraction(const two_term turns)
 {

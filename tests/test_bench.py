@@ -216,11 +216,7 @@ def test_every_case_tells_a_right_answer_from_one_a_little_off(
             reason = check(ours)
         for function in cached():
             function.cache_clear()
-        off = 3e-6 / bench_cases.NSR  # what a transfer function's bound leaves open after the filter
-        if work.form == "new mask or depth":
-            assert ours.error() < off
-        else:
-            assert "wrong result" in reason, work.name
+        assert "wrong result" in reason, work.name
 
 
 def test_a_copy_that_copies_nothing_is_refused(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

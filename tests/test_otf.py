@@ -13,7 +13,8 @@ from adof_cl import reference
 from adof_cl.device import Device
 from adof_cl.errors import InputError, LimitError
 from adof_cl.optics import OpticalSystem, PupilGrid
-from adof_cl.otf import Otf1d, SeparableMaskOtf, stationary_phase_otf
+from adof_cl.otf import FAMILIES, Otf1d, SeparableMaskOtf, _halves, stationary_phase_otf
+from adof_cl.program import Launch, Program
 
 # alpha, psi, u, H to 20 digits, from the error-function form in 50-digit arithmetic.
 KNOWN = (
@@ -38,16 +39,22 @@ U = np.concatenate([U, -U])
 signs = st.sampled_from([1.0, -1.0])
 strengths = st.one_of(
     st.just(0.0),
-    st.floats(-3, 4).map(lambda power: 10**power),
-    st.sampled_from([1e-3, 0.1, 1.0, 53.5, 1e3, 1e4]),
+    st.floats(-3, 5).map(lambda power: 10**power),
+    st.sampled_from([1e-3, 0.1, 1.0, 53.5, 1e3, 1e4, 1e5]),
 )
-defoci = st.one_of(st.floats(0, 150), st.floats(-6, 2).map(lambda power: 10**power))
+defoci = st.one_of(st.floats(0, 500), st.floats(-6, 2).map(lambda power: 10**power))
+
+Plans = dict[tuple[str, str], Otf1d]
 
 
 @pytest.fixture(scope="module")
-def plans(device: Device) -> dict[str, Otf1d]:
+def plans(device: Device) -> Plans:
     kinds = ["float32", "float64"] if device.facts.fp64 else ["float32"]
-    return {kind: Otf1d(device, U, precision=kind) for kind in kinds}
+    return {
+        (kind, family): Otf1d(device, U, precision=kind, family=family)
+        for kind in kinds
+        for family in FAMILIES
+    }
 
 
 @pytest.mark.parametrize(("alpha", "psi", "u", "expected"), KNOWN)
@@ -76,17 +83,17 @@ def test_both_routes_of_the_reference_agree(alpha: float, psi: float) -> None:
 @settings(max_examples=60)
 @given(alpha=strengths, psi=defoci, sign=signs, side=signs)
 def test_the_device_agrees_with_the_reference_for_every_strength_and_defocus(
-    plans: dict[str, Otf1d], alpha: float, psi: float, sign: float, side: float
+    plans: Plans, alpha: float, psi: float, sign: float, side: float
 ) -> None:
     expected = reference.otf_1d(U, sign * alpha, side * psi)
-    for kind, plan in plans.items():
+    for (kind, _), plan in plans.items():
         error = np.abs(plan.evaluate(sign * alpha, side * psi) - expected)
         assert error.max() <= tolerances.otf_error(kind, alpha)
 
 
 @pytest.mark.parametrize("alpha", [1e-3, 0.37, 20.0, 1e3])
 def test_the_device_is_accurate_where_the_stationary_point_crosses_the_overlaps_end(
-    plans: dict[str, Otf1d], alpha: float
+    plans: Plans, alpha: float
 ) -> None:
     # q = c b: psi = 3 alpha b, for every u in turn, and its nearest neighbours on both sides.
     for u in np.linspace(0.05, 1.9, 12):
@@ -94,9 +101,129 @@ def test_the_device_is_accurate_where_the_stationary_point_crosses_the_overlaps_
         for near in (psi, psi * (1 + 1e-6), psi * (1 - 1e-6)):
             if near > 150:
                 continue
-            for kind, plan in plans.items():
+            for (kind, _), plan in plans.items():
                 error = np.abs(plan.evaluate(alpha, near) - reference.otf_1d(U, alpha, near))
                 assert error.max() <= tolerances.otf_error(kind, alpha)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0, 20.0, 53.5, 100.0, 1e3, 1e4])
+def test_errors_stay_below_what_is_promised(plans: Plans, alpha: float) -> None:
+    promised = {"float32": 4e-7, "float64": 5e-14}
+    for psi in (0.0, 1.0, 15.0, 60.0, 135.0, 150.0):
+        expected = reference.otf_1d(U, alpha, psi)
+        for (kind, family), plan in plans.items():
+            assert np.abs(plan.evaluate(alpha, psi) - expected).max() < promised[kind], (kind, family, psi)
+
+
+@pytest.mark.parametrize("vector_bytes", [16, 32, 64])
+@pytest.mark.parametrize("samples", [3, 30, 65])
+def test_vectors_of_every_width_give_the_same(
+    device: Device, monkeypatch: pytest.MonkeyPatch, precision: str, vector_bytes: int, samples: int
+) -> None:
+    monkeypatch.setattr(device, "vector_bytes", vector_bytes)
+    u = 3.5 * np.concatenate([np.fft.fftfreq(samples), np.fft.fftfreq(samples + 1)])
+    found = Otf1d(device, u, precision=precision, family="lanes").evaluate(35.0, -70.0)
+    assert np.abs(found - reference.otf_1d(u, 35.0, -70.0)).max() <= tolerances.otf_error(precision, 35.0)
+
+
+_TURNS = """
+#include "turns.h"
+__kernel void turns_check(__global const real2 *turns, __global const real2 *halves, __global real *beyond,
+                          __global cplx *wave)
+{
+    const int i = get_global_id(0);
+    turns_factor a;
+    turns_split(turns[i], &a);
+    beyond[i] = turns_product(a, halves[i].x, halves[i].y);
+    cvec w;
+    turns_wave(turns[i].x, &w);
+    wave[i] = (cplx)(w.re, w.im);
+}
+"""
+
+
+def test_whole_turns_are_dropped_before_anything_is_rounded(device: Device, precision: str) -> None:
+    real = np.dtype(precision)
+    rng = np.random.default_rng(5)
+    turns = np.concatenate([[0.0, 0.25, 0.5, 0.75, 1.0, 1e5], rng.uniform(-1.6e4, 1.6e4, 2000)])
+    factors = np.concatenate([[1.0, 2.0, 0.5], rng.uniform(0, 2, turns.size - 3)])
+    hi = turns.astype(real)
+    bits = 12 if precision == "float32" else 26
+    coarse, _ = _halves(factors, real)
+    split = [np.stack(pair, axis=1).astype(real) for pair in ((hi, turns - hi), (coarse, factors - coarse))]
+    beyond, wave = (
+        device.empty(turns.shape, real),
+        device.empty(turns.shape, np.result_type(real, np.complex64)),
+    )
+    program = Program(
+        device,
+        "precision.h",
+        {"REAL_IS_DOUBLE": precision == "float64"},
+        generated=("turns_check.cl", _TURNS),
+    )
+    program.launch("turns_check", turns.shape, None, *map(device.upload, split), beyond, wave)()
+    wide = np.longdouble
+    product = turns.astype(wide) * factors.astype(wide)
+
+    def off(found: np.ndarray) -> np.ndarray:
+        apart = found.astype(wide) - product
+        return np.abs(apart - np.rint(apart))
+
+    # Eq. P3: the fraction is rounded as a number near 1; the rest, 4/2^bits of the product, three times.
+    limit = tolerances.eps(precision) * (1 + 3 * 2.0 ** (2 - bits) * np.abs(product))
+    assert np.all(off(beyond.download()) <= limit)
+    naive = hi * factors.astype(real)
+    assert off(naive).max() > 50 * limit.max()
+
+    angle = 2 * np.arctan2(wide(0), wide(-1)) * (hi - np.rint(hi)).astype(wide)
+    exact = (np.cos(angle) + 1j * np.sin(angle)).astype(np.complex128)
+    apart = wave.download() - exact
+    # Eq. P4: r^2 <= 1/16 and what it is last multiplied with, at most 20, are rounded, then their product and
+    # sum: 2 * 20/16 + 2 halves of eps.
+    assert max(np.abs(apart.real).max(), np.abs(apart.imag).max()) <= 2.25 * tolerances.eps(precision)
+
+
+def test_lists_that_only_look_like_an_axis_are_evaluated_in_full(device: Device) -> None:
+    u = 3.5 * np.fft.fftfreq(21)
+    wanted = reference.otf_1d(u, 20.0, 5.0)
+    gain = np.ones(21)
+    gain[17] = 0.5  # its mirror image has another
+    found = Otf1d(device, u, gain=gain).evaluate(20.0, 5.0)
+    assert np.abs(found - wanted * gain).max() <= tolerances.otf_error("float32", 20.0)
+    bent = u.copy()
+    bent[17] *= 1.25
+    found = Otf1d(device, bent).evaluate(20.0, 5.0)
+    assert np.abs(found - reference.otf_1d(bent, 20.0, 5.0)).max() <= tolerances.otf_error("float32", 20.0)
+
+
+@pytest.mark.parametrize(("pairs", "launches"), [(1, 1), (56, 1), (57, 2)])
+def test_many_pairs_are_one_launch(
+    device: Device, monkeypatch: pytest.MonkeyPatch, pairs: int, launches: int
+) -> None:
+    plan = Otf1d.for_frame(device, OpticalSystem(), (24, 17), pairs=pairs)
+    wanted = [(20.0 + k, k - 30.0) for k in range(pairs)]
+    counted: list[Launch] = []
+    enqueue = Launch.__call__
+
+    def count(self: Launch) -> object:
+        counted.append(self)
+        return enqueue(self)
+
+    monkeypatch.setattr(Launch, "__call__", count)
+    found = plan(wanted).download()
+    assert len(counted) == launches
+    for row in (0, pairs - 1):
+        assert np.abs(found[row] - _of_frame(OpticalSystem(), (24, 17), wanted[row])).max() <= 3e-6
+
+
+def _of_frame(optics: OpticalSystem, shape: tuple[int, ...], pair: tuple[float, float]) -> np.ndarray:
+    axes = []
+    for n in shape:
+        axis = reference.otf_1d(optics.frequency_axis(n), *pair) * optics.pixel_otf_axis(n)
+        if n % 2 == 0:
+            axis[n // 2] = axis[n // 2].real
+        axes.append(axis)
+    return np.concatenate(axes)
 
 
 def test_the_textbook_closed_form_would_fail_in_float32() -> None:
@@ -114,7 +241,7 @@ def test_the_textbook_closed_form_would_fail_in_float32() -> None:
 
 @settings(max_examples=20)
 @given(alpha=strengths, psi=defoci)
-def test_symmetries_hold_to_the_last_bit(plans: dict[str, Otf1d], alpha: float, psi: float) -> None:
+def test_symmetries_hold_to_the_last_bit(plans: Plans, alpha: float, psi: float) -> None:
     half = U.size // 2
     for plan in plans.values():
         h = plan.evaluate(alpha, psi)
@@ -125,11 +252,9 @@ def test_symmetries_hold_to_the_last_bit(plans: dict[str, Otf1d], alpha: float, 
 
 @settings(max_examples=20)
 @given(alpha=strengths, psi=defoci)
-def test_no_mask_passes_more_than_the_diffraction_limit(
-    plans: dict[str, Otf1d], alpha: float, psi: float
-) -> None:
+def test_no_mask_passes_more_than_the_diffraction_limit(plans: Plans, alpha: float, psi: float) -> None:
     limit = np.maximum(1 - np.abs(U) / 2, 0)
-    for kind, plan in plans.items():
+    for (kind, _), plan in plans.items():
         h = plan.evaluate(alpha, psi)
         assert abs(complex(h[0]) - 1) <= tolerances.otf_error(kind, alpha)
         assert np.all(np.abs(h) <= limit + tolerances.otf_error(kind, alpha))
@@ -170,7 +295,7 @@ def test_a_camera_axis_maps_real_images_to_real_images(device: Device, precision
 def test_no_kernel_of_the_optics_asks_for_doubles_in_float32() -> None:
     folder = Path(__file__).parents[1] / "kernels"
     names = ["otf.cl", "psf.cl", "pupil_phase.cl", "slm_encode.cl", "fresnel.h", "two_term.h", "stockham.h"]
-    for name in [*names, "phase_turns.h"]:
+    for name in [*names, "phase_turns.h", "turns.h"]:
         code = re.sub(r"//.*", "", (folder / name).read_text())
         code = re.sub(r"REAL_C\([^()]*\)", "", code)
         assert not re.search(r"\bdouble\b|\d\.\d|\d[eE][-+]?\d", code), name
@@ -207,6 +332,16 @@ def test_a_gain_of_another_length_and_a_wrong_count_of_pairs_are_refused(device:
         Otf1d(device, U, pairs=2)([(1.0, 0.0)])
     with pytest.raises(InputError, match="precision"):
         Otf1d(device, U, precision="half")
+    with pytest.raises(InputError, match="family is 'warps'"):
+        Otf1d(device, U, family="warps")
+
+
+def test_a_refused_pair_leaves_the_result_as_it_was(device: Device) -> None:
+    plan = Otf1d(device, U, pairs=2)
+    before = plan([(20.0, 5.0), (30.0, 0.0)]).download()
+    with pytest.raises(LimitError):
+        plan([(1.0, 0.0), (2e5, 0.0)])
+    assert np.array_equal(plan.out.download(), before)
 
 
 # ---- other separable masks --------------------------------------------------------------------------------
