@@ -22,7 +22,6 @@ FAMILIES = ("lanes", "groups")
 _GROUP = 64
 _ITEMS_PER_UNIT = 4  # so that no core waits long for the last
 _PAIR_BYTES = 896  # by value: with the other arguments within the 1024 that every device takes
-_LIMITS_RAD = np.array([ALPHA_LIMIT_RAD, PSI_LIMIT_RAD])
 
 
 class Otf1d:
@@ -203,13 +202,13 @@ class Otf1d:
             raise InputError(
                 f"pairs has shape {wanted.shape}: {self._pairs_shape} of (alpha, psi) was wanted, as planned"
             )
-        if not (np.abs(wanted) <= _LIMITS_RAD).all():
-            for alpha, psi in wanted:
-                require_envelope(float(alpha), float(psi))
+        for alpha, psi in wanted.tolist():
+            if not (abs(alpha) <= ALPHA_LIMIT_RAD and abs(psi) <= PSI_LIMIT_RAD):
+                require_envelope(alpha, psi)  # says what is wrong
         turns = wanted * (1 / (2 * math.pi))
-        hi, lo = self._turns[: len(turns), :, 0], self._turns[: len(turns), :, 1]
-        hi[...] = turns
-        np.subtract(turns, hi, out=lo, casting="same_kind")
+        parts = self._turns[: len(turns)]
+        parts[..., 0] = turns
+        parts[..., 1] = turns - parts[..., 0]
         for index, launch in enumerate(self._launches):
             launch.set(8, self._argument(index))
             launch()

@@ -91,11 +91,14 @@ class _Steps:
         self._launches = launches
         self._told = told
         self._apart = apart
+        self._values: dict[str, Argument] = {}
 
     def set(self, **values: Argument) -> None:
         for name, value in values.items():
-            for launch, index in self._places[name]:
-                launch.set(index, value)
+            if value is not self._values.get(name, self):
+                self._values[name] = value
+                for launch, index in self._places[name]:
+                    launch.set(index, value)
 
     def run(self, first: int, end: int) -> None:
         if len(self._launches) > 1:
@@ -105,7 +108,8 @@ class _Steps:
         (launch,) = self._launches
         edges = (*range(first, end), end) if self._apart else (first, end)
         for start, stop in pairwise(edges):
-            launch.update(dict(zip(self._told, (_NUMBERS[start], _NUMBERS[stop]), strict=True)))
+            launch.set(self._told[0], _NUMBERS[start])
+            launch.set(self._told[1], _NUMBERS[stop])
             launch()
 
 
@@ -115,8 +119,9 @@ class _Filter:
 
     formed: bool = False
     noise: np.generic | None = None
-    long_axis: DeviceArray | None = None
-    short_axis: DeviceArray | None = None
+    axes: DeviceArray | None = None
+    entry: np.int32 | None = None
+    own_axes: DeviceArray | None = None
     stored: DeviceArray | None = None
 
 
@@ -296,6 +301,9 @@ class Restore:
         frequency[:held] = np.argsort(place[:held])
         known = np.maximum(frequency, 0)
         places = device.upload(np.stack([place[known], place[(outer.length - known) % outer.length]]))
+        # Where an H is in a table of both axes, rows' first; places to spare take any.
+        along, across = (ny, 0) if cut.half_rows else (0, ny)
+        bins = device.upload(np.concatenate([along + inner.order(), across + known]).astype(np.int32))
         self._spectrum = device.empty(cut.spectrum, self.spectrum_dtype)
         blends = [
             self._table(padding_weights(p - n, taper)) for p, n in zip((ny, nx), self.shape, strict=True)
@@ -308,14 +316,14 @@ class Restore:
             tasks = device.upload(np.zeros(16 * (4 + 3 * workers), np.int32))
             frame = program.launch(
                 "restore_frame", (workers,), (1,),
-                None, self._spectrum, self._spectrum, None, None, None, None, places, outer_turns,
-                outer_blend, inner_turns, inner_blend, tasks, i32(0), i32(3), zero, zero,
+                None, self._spectrum, self._spectrum, None, None, None, bins, places, outer_turns,
+                outer_blend, inner_turns, inner_blend, tasks, i32(0), i32(3), i32(0), zero, zero,
             )  # fmt: skip
             self._steps = _Steps(
                 {
                     "frame": [(frame, 0)], "filtered": [(frame, 2)], "image": [(frame, 3)],
-                    "filter": [(frame, 4)], "long_axis": [(frame, 5)], "short_axis": [(frame, 6)],
-                    "noise": [(frame, 15)], "scale": [(frame, 16)],
+                    "filter": [(frame, 4)], "otf": [(frame, 5)], "otf_from": [(frame, 15)],
+                    "noise": [(frame, 16)], "scale": [(frame, 17)],
                 },
                 frame,
                 told=(13, 14),
@@ -332,8 +340,8 @@ class Restore:
             )  # fmt: skip
             middle = program.launch(
                 "restore_columns", inner_size, inner_group,
-                self._spectrum, self._spectrum, None, None, None, inner_turns, inner_blend, *inner_scratch,
-                zero, zero,
+                self._spectrum, self._spectrum, None, None, bins, inner_turns, inner_blend, *inner_scratch,
+                i32(0), zero, zero,
             )  # fmt: skip
             last = program.launch(
                 "restore_rows_inverse", outer_size, outer_group,
@@ -343,8 +351,8 @@ class Restore:
             self._steps = _Steps(
                 {
                     "frame": [(first, 0)], "filtered": [(middle, 1), (last, 0)], "image": [(last, 1)],
-                    "filter": [(middle, 2)], "long_axis": [(middle, 3)], "short_axis": [(middle, 4)],
-                    "noise": [(middle, after)], "scale": [(middle, after + 1)],
+                    "filter": [(middle, 2)], "otf": [(middle, 3)], "otf_from": [(middle, after)],
+                    "noise": [(middle, after + 1)], "scale": [(middle, after + 2)],
                 },
                 first,
                 middle,
@@ -365,7 +373,6 @@ class Restore:
         self._lift = 2.0 ** (300 if self._real == np.float64 else 40)  # both factors of H are lifted, so H is
         self._lifted_scale = self._real.type(self._lift * self._scale)
         self._filter_shape = (cut.shorts // cut.block, inner.length, 2, cut.block)
-        self._shorts, self._longs = cut.shorts, inner.length
         self._filters: dict[int, _Filter] = {}
         size = (cut.shorts, inner.length)
         tables, sides = (device.upload(inner.order()), device.upload(frequency)), (i32(ny), i32(nx))
@@ -373,14 +380,9 @@ class Restore:
             "wiener_axes", size, None,
             None, None, None, *tables, None, *sides, i32(0), i32(0), zero, self._real.type(self._scale),
         )  # fmt: skip
-        self._pair = wiener.launch(
-            "wiener_pair", (max(size),), None,
-            None, None, *tables, None, None, *sides, i32(0), i32(0), i32(inner.length), i32(cut.shorts),
-        )  # fmt: skip
         self._arrange = wiener.launch(
             "wiener_arrange", size, None, None, *tables, None, *sides, self._real.type(self._scale)
         )
-        self._axes = device.empty((ny + nx,), self._complex)
         self._noise: DeviceArray | None = None
         self._gain: DeviceArray | None = None
         self._filtered: DeviceArray | None = None
@@ -418,20 +420,25 @@ class Restore:
             if self._noise is None:
                 self._noise = self.device.empty(noise.shape, self._real)
             level = self._noise.upload(noise.astype(self._real))
-        self.set_filter_table(self._axes.upload(np.concatenate(axes).astype(self._complex)), level, slot)
+        kept = self._filters.setdefault(slot, _Filter())
+        if kept.own_axes is None:
+            kept.own_axes = self.device.empty((ny + nx,), self._complex)
+        self.set_filter_table(kept.own_axes.upload(np.concatenate(axes).astype(self._complex)), level, slot)
 
     def set_filter_table(
         self, table: DeviceArray, nsr: float | DeviceArray, slot: int = 0, *, entry: int = 0
     ) -> None:
-        """Set a separable filter from 1-D OTFs that are on the device already; enqueues one small kernel.
+        """Set a separable filter from 1-D OTFs that are on the device already.
 
-        With one level of noise no filter is ever stored: the middle step forms it in registers.
+        With one level of noise nothing is enqueued and no filter is ever stored: the middle step of every
+        frame forms it in registers from the table as it then is. Update the table, and the next frame has a
+        new filter.
 
         Parameters
         ----------
         table
-            (ny + nx,) or (k, ny + nx), complex of this plan's precision: h_rows, then h_cols, as
-            `OtfTable.out` holds them; its values are not checked.
+            (ny + nx,) or (k, ny + nx), complex of this plan's precision: h_rows, then h_cols, with real
+            Nyquist bins, as `OtfTable.out` holds them; its values are not checked.
         nsr
             A number, or (ny, nx // 2 + 1) real on the device.
         entry
@@ -452,7 +459,7 @@ class Restore:
         entries = table.size // (ny + nx)
         if not 0 <= entry < entries:
             raise InputError(f"entry {entry} of the table was asked for: it has {entries}, counted from 0")
-        rows_from, cols_from = np.int32(entry * (ny + nx)), np.int32(entry * (ny + nx) + ny)
+        first = np.int32(entry * (ny + nx))
         if isinstance(nsr, DeviceArray):
             if nsr.shape != (ny, nx // 2 + 1) or nsr.dtype != self._real:
                 raise InputError(
@@ -460,21 +467,15 @@ class Restore:
                     "value for each frequency of the padded half spectrum"
                 )
             stored = self._stored_filter(slot)
-            self._form.update({0: table, 1: table, 2: nsr, 5: stored, 8: rows_from, 9: cols_from})
+            self._form.update({0: table, 1: table, 2: nsr, 5: stored, 8: first, 9: first + np.int32(ny)})
             self._form()
             return
         level = float(nsr)
         if not 0 <= level < math.inf:
             checked_nsr(level, (ny, nx // 2 + 1))  # says what is wrong
         kept = self._filters.setdefault(slot, _Filter())
-        if kept.long_axis is None or kept.short_axis is None:
-            kept.long_axis = self.device.empty((self._longs, 2), self._real)
-            kept.short_axis = self.device.empty((self._shorts, 2), self._real)
-        kept.formed, kept.noise = True, self._real.type(self._lift * self._lift * level)
-        self._pair.update(
-            {0: table, 1: table, 4: kept.long_axis, 5: kept.short_axis, 8: rows_from, 9: cols_from}
-        )
-        self._pair()
+        kept.formed, kept.axes, kept.entry = True, table, first
+        kept.noise = self._real.type(self._lift * self._lift * level)
 
     def set_filter(self, gain: ArrayLike | DeviceArray, slot: int = 0) -> None:
         """Set any restoration filter: what each frequency of the padded frame is multiplied by.
@@ -599,8 +600,8 @@ class Restore:
         if kept.formed:
             self._steps.set(
                 filter=None,
-                long_axis=kept.long_axis,
-                short_axis=kept.short_axis,
+                otf=kept.axes,
+                otf_from=kept.entry,
                 noise=kept.noise,
                 scale=self._lifted_scale,
             )
@@ -661,6 +662,9 @@ def _checked_axis(name: str, values: ArrayLike, length: int) -> NDArray[Any]:
         )
     if not np.isfinite(axis).all():
         raise InputError(f"{name} holds NaN or infinity: a finite OTF was wanted")
+    if length % 2 == 0:  # the half spectrum of a real image has no room for a sign there
+        axis = axis.copy()
+        axis[length // 2] = axis[length // 2].real
     return axis
 
 

@@ -299,18 +299,18 @@ def check_wiener(device: Device, size: Size, precision: str) -> Iterator[Outcome
             )
 
     for half_rows in (0, 1):
-        yield from _laid_out(device, otf, (rows.copy(), columns.copy()), half_rows, precision)
+        yield from _laid_out(device, otf, (rows.size, columns.size), half_rows, precision)
 
 
 def _laid_out(
     device: Device,
     gain: NDArray[np.complexfloating[Any, Any]],
-    axes: tuple[NDArray[Any], NDArray[Any]],
+    padded: Size,
     half_rows: int,
     precision: str,
 ) -> Iterator[Outcome]:
     """What the restoration reads: blocks of the axis of which half is held, the other whole, both mixed."""
-    (ny, nx), block, scale = (axes[0].size, axes[1].size), 4, 0.375
+    (ny, nx), block, scale = padded, 4, 0.375
     rng = np.random.default_rng(6)
     short, long = (ny, nx) if half_rows else (nx, ny)
     held = short // 2 + 1
@@ -350,32 +350,6 @@ def _laid_out(
     # The mean of two, and a product; and what two transforms there and back lose on the page.
     bound = 2 * _eps(precision) + 10 * _eps("float64")
     yield outcome("wiener_arrange", out.download(), wanted, bound)
-
-    h_rows, h_cols = axes
-    table = device.upload(np.concatenate([h_rows, h_cols]))
-    long_axis = device.empty((long, 2), real)
-    short_axis = device.empty((shorts // block, 2, block), real)
-    program.launch(
-        "wiener_pair", (max(long, shorts),), None,
-        table, table, *tables, long_axis, short_axis, *sides, np.int32(0), np.int32(ny), np.int32(long),
-        np.int32(shorts),
-    )()  # fmt: skip
-    lift = 2.0 ** (150 if precision == "float64" else 20)
-    for axis in axes:
-        if axis.size % 2 == 0:
-            axis[axis.size // 2] = axis[axis.size // 2].real
-    h_short, h_long = axes if half_rows else axes[::-1]
-    yield outcome(
-        "wiener_pair",
-        short_axis.download()[:, None] / lift,
-        h_short[frequency[:held]][:, None],
-        _eps(precision),
-    )
-    found = long_axis.download() / lift
-    apart = np.abs(found[:, 0] + 1j * found[:, 1] - h_long[order])
-    yield Outcome(
-        f"wiener_pair along, {where}", ("wiener_pair",), "|dH|", float(apart.max()), _eps(precision)
-    )
 
 
 def check_restore(device: Device, size: Size, precision: str) -> Iterator[Outcome]:
@@ -443,7 +417,7 @@ def _restored(plan: Restore, name: str, precision: str) -> Outcome:
                 bound = _eps("float32") / 2
     return Outcome(
         name,
-        (*_RESTORE_KERNELS[plan.family], "wiener_axes", "wiener_pair", "wiener_arrange"),
+        (*_RESTORE_KERNELS[plan.family], "wiener_axes", "wiener_arrange"),
         "levels" if kind.kind == "u" else "relative L2",
         error,
         bound,

@@ -14,21 +14,23 @@
 //   filtered  like spectrum                     may be the spectrum itself
 //   filter    (BLOCKS, NY, 2, BLOCK) real       the same, vertical frequencies digit-reversed, times the scale below.
 //                                               Or null:
-//   long_axis (NY, 2) real, short_axis (BLOCKS, 2, BLOCK) real   H along y and x as wiener_pair lays it out
+//   otf       (.., 2) real                      1-D OTFs, DC first, from number `otf_from` on; real where Nyquist is
+//   bin       (NY + BLOCKS * BLOCK) int         where the H of a place is among them: along y, then along x
 //   position  (2, BLOCKS * BLOCK) int           where a column's frequency k, and NX - k, lie after the passes
-//   noise, scale              real              nsr and what the transforms leave undone, as wiener_pair wants
+//   noise, scale              real              nsr and what the transforms leave undone, lifted (W9)
 //   row_blend (NX - COLS) real, column_blend (NY - ROWS) real   share of the near edge in the padding
 //   row_turns, column_turns   real              twiddle factors, pass by pass: cos and -sin, q = 1 .. R - 1
 //   scratch   (work-groups, 2, samples) real    used where local memory is too small, else null
 //
 // Defines as in restore_lanes.cl, and: BLOCK columns per block; ROW_ITEMS, COLUMN_ITEMS work-items per group,
-// COLUMN_ITEMS a multiple of BLOCK; BLOCKS of columns, HELD rows of the spectrum; ROW_LOCAL, COLUMN_LOCAL 1: the samples stand in local memory, 0: in
-// `scratch`, for axes longer than local memory allows.
+// COLUMN_ITEMS a multiple of BLOCK; BLOCKS of columns, HELD rows of the spectrum; ROW_LOCAL, COLUMN_LOCAL 1: the
+// samples stand in local memory, 0: in `scratch`, for axes longer than local memory allows.
 //
 // Local memory: 2 NX reals for rows, 2 NY BLOCK reals for columns. One barrier after each pass.
 // Error: below 4e-7 (float) and 1e-15 (double), relative L2, 8 x 8 to 1024 x 1024, PoCL and Intel's runtime.
 
 #include "restore_butterflies.h"
+#include "wiener_lift.h"
 
 #if ROW_LOCAL
 #define ROW_SPACE   __local
@@ -154,8 +156,8 @@ typedef real stored;
 #define RESTORE_DEFINE_WIENER(R)                                                                            \
     ALWAYS_INLINE void restore_wiener##R(COLUMN_SPACE real *re, COLUMN_SPACE real *im, const int lane,      \
                                          const int worker, const int workers,                               \
-                                         __global const real *long_axis, const cplx h, const real noise,    \
-                                         const real scale)                                                  \
+                                         __global const real *otf, __global const int *bin, const cplx h,   \
+                                         const real noise, const real scale)                                \
     {                                                                                                       \
         for (int i = worker; i < NY / R; i += workers) {                                                    \
             vec xr[R], xi[R];                                                                               \
@@ -167,7 +169,8 @@ typedef real stored;
             restore_radix##R(xr, xi);                                                                       \
             _Pragma("unroll")                                                                               \
             for (int q = 0; q < R; ++q) {                                                                   \
-                const real gr = long_axis[2 * (i * R + q)], gi = long_axis[2 * (i * R + q) + 1];            \
+                const real gr = WIENER_LIFT * otf[2 * bin[i * R + q]];                                      \
+                const real gi = WIENER_LIFT * otf[2 * bin[i * R + q] + 1];                                  \
                 const real power = (gr * gr + gi * gi) * (h.x * h.x + h.y * h.y) + noise;                   \
                 const real share = power > 0 ? scale / power : 0;                                           \
                 const real tr = xr[q] * gr + xi[q] * gi, ti = xi[q] * gr - xr[q] * gi;                      \
@@ -210,7 +213,7 @@ RESTORE_DEFINE(15)
     restore_backCOLUMN##R(re, im, NY, M, BLOCK, lane, worker, COLUMN_ITEMS / BLOCK, column_turns + T);
 #define COLUMN_FILTER(R, M, T) restore_filter##R(re, im, lane, worker, COLUMN_ITEMS / BLOCK, block_filter);
 #define COLUMN_WIENER(R, M, T) \
-    restore_wiener##R(re, im, lane, worker, COLUMN_ITEMS / BLOCK, long_axis, h, noise, scale);
+    restore_wiener##R(re, im, lane, worker, COLUMN_ITEMS / BLOCK, axes, bin, h, noise, scale);
 
 // A sample of a frame's row, padded; 0 below the frame.
 ALWAYS_INLINE real restore_sample(__global const IN_TYPE *frame, const int row, const int col,
@@ -273,11 +276,12 @@ restore_columns(
     __global const stored *spectrum,
     __global stored       *filtered,
     __global const real *restrict filter,
-    __global const real *restrict long_axis,
-    __global const real *restrict short_axis,
+    __global const real *restrict otf,
+    __global const int  *restrict bin,
     __global const real *restrict column_turns,
     __global const real *restrict column_blend,
     __global real       *restrict scratch,
+    const int otf_from,
     const real noise, const real scale)
 {
     COLUMN_WORK(NY * BLOCK);
@@ -306,7 +310,9 @@ restore_columns(
     if (filter) {
         COLUMN_LAST(COLUMN_FILTER)
     } else {
-        const cplx h = (cplx)(short_axis[block * 2 * BLOCK + lane], short_axis[(block * 2 + 1) * BLOCK + lane]);
+        __global const real *axes = otf + 2 * otf_from;
+        const int at = 2 * bin[NY + block * BLOCK + lane];
+        const cplx h = WIENER_LIFT * (cplx)(axes[at], axes[at + 1]);
         COLUMN_LAST(COLUMN_WIENER)
     }
     COLUMN_MIDDLE_BACK(COLUMN_BACK)

@@ -17,13 +17,14 @@
 //   filtered  like spectrum                     may be the spectrum itself
 //   filter    (SLOTS / LANES, NX, 2, LANES) real   block of vertical frequencies; horizontal ones, digit-reversed;
 //                                               times the scale below. Or null:
-//   long_axis (NX, 2) real, short_axis (SLOTS / LANES, 2, LANES) real   H along x and y as wiener_pair lays it out
+//   otf       (.., 2) real                      1-D OTFs, DC first, from number `otf_from` on; real where Nyquist is
+//   bin       (NX + SLOTS) int                  where the H of a place is among them: along x, then along y
 //   position  (2, SLOTS) int                    where a slot's frequency k, and NY - k, lie after the passes
 //   row_blend (NX - COLS) real, column_blend (NY - ROWS) real   share of the near edge in the padding
 //   row_turns, column_turns   real              twiddle factors, pass by pass: cos and -sin, q = 1 .. R - 1
 //   tasks     (16 * (4 + 3 * work-items)) int   counters of the tasks, 0 before and after
 //   first, last               int               steps to do: 0 and 3 for all
-//   noise, scale              real              nsr and what the transforms leave undone, as wiener_pair wants
+//   noise, scale              real              nsr and what the transforms leave undone, lifted (W9)
 //
 // A work-item's samples lie real, imaginary, real, .. : apart, the strides of a power of two would fill the
 // same cache sets twice over.
@@ -36,11 +37,13 @@
 //
 // One work-item a processor core, each taking tasks until there are none; local size 1; no local memory, no barriers.
 // A launch of one step is safe on any device; of several where work-items of one launch see each other's global
-// writes after atomics, as they do on processors. Private memory: two vectors for each sample of a row or column.
+// writes after atomics, as they do on processors. Private memory: two vectors for each sample of a row or column,
+// and H along x.
 // Error: below 4e-7 (float) and 1e-15 (double), relative L2, 8 x 8 to 1024 x 1024, PoCL and Intel's runtime.
 
 #include "restore_transpose.h"
 #include "restore_butterflies.h"
+#include "wiener_lift.h"
 
 #define STRIP (2 * LANES)
 
@@ -261,7 +264,7 @@ ALWAYS_INLINE void restore_scatter(const vec *work, __global OUT_TYPE *image, co
             restore_put##R(work + 2 * b, 1, xr, xi);                                                        \
         }                                                                                                   \
     }                                                                                                       \
-    ALWAYS_INLINE void restore_wiener##R(vec *work, const int length, __global const real *long_axis,       \
+    ALWAYS_INLINE void restore_wiener##R(vec *work, const int length, const real *along,                    \
                                          const vec hr, const vec hi, const real noise, const real scale)    \
     {                                                                                                       \
         const vec short_power = hr * hr + hi * hi;                                                          \
@@ -271,7 +274,7 @@ ALWAYS_INLINE void restore_scatter(const vec *work, __global OUT_TYPE *image, co
             restore_radix##R(xr, xi);                                                                       \
             _Pragma("unroll")                                                                               \
             for (int q = 0; q < R; ++q) {                                                                   \
-                const real gr = long_axis[2 * (b + q)], gi = long_axis[2 * (b + q) + 1];                    \
+                const real gr = along[2 * (b + q)], gi = along[2 * (b + q) + 1];                            \
                 const vec power = (gr * gr + gi * gi) * short_power + noise;                                \
                 const vec share = power > (vec)(0) ? scale / power : (vec)(0);                              \
                 const vec tr = xr[q] * gr + xi[q] * gi, ti = xi[q] * gr - xr[q] * gi;                       \
@@ -302,7 +305,7 @@ RESTORE_DEFINE_PASSES(15)
 #define ROW_FORWARD(R, M, T)    restore_forward##R(part, length, M, row_turns + T);
 #define ROW_BACK(R, M, T)       restore_back##R(part, length, M, row_turns + T);
 #define ROW_FILTER(R, M, T)     restore_filter##R(part, length, block_filter + 2 * b);
-#define ROW_WIENER(R, M, T)     restore_wiener##R(part, length, long_axis + 2 * b, hr, hi, noise, scale);
+#define ROW_WIENER(R, M, T)     restore_wiener##R(part, length, along + 2 * b, hr.all, hi.all, noise, scale);
 
 // ---- steps ------------------------------------------------------------------------------------------------
 
@@ -344,10 +347,11 @@ STEP void restore_columns_forward(vec *work, const int strip, __global const IN_
     for (int i = 4 * HELD; i < 4 * SLOTS; ++i) PUT(out, i, (vec)(0));
 }
 
-// LANES vertical frequencies there and back; the columns of the padding are made here.
+// LANES vertical frequencies there and back; the columns of the padding are made here. `along` is H along x, in the
+// order the passes leave, `otf` and `bin` are those of the vertical frequencies.
 STEP void restore_rows(vec *work, const size_t block, __global const stored *spectrum,
                        __global stored *filtered, __global const vec *filter,
-                       __global const real *long_axis, __global const vec *short_axis,
+                       const real *along, __global const real *otf, __global const int *bin,
                        __global const real *row_turns, __global const real *row_blend,
                        const real noise, const real scale)
 {
@@ -379,6 +383,14 @@ STEP void restore_rows(vec *work, const size_t block, __global const stored *spe
         ROW_FIRST(ROW_FORWARD)
     }
     __global const vec *block_filter = filter + 2 * block * NX;
+    union { vec all; real of[LANES]; } hr = {0}, hi = {0};
+    if (!filter) {
+        for (int k = 0; k < LANES; ++k) {
+            const int at = 2 * bin[block * LANES + k];
+            hr.of[k] = WIENER_LIFT * otf[at];
+            hi.of[k] = WIENER_LIFT * otf[at + 1];
+        }
+    }
     for (int b = 0; b < NX; b += ROW_INNER) {
         vec *part = work + 2 * b;
         const int length = ROW_INNER;
@@ -386,7 +398,6 @@ STEP void restore_rows(vec *work, const size_t block, __global const stored *spe
         if (filter) {
             ROW_LAST(ROW_FILTER)
         } else {
-            const vec hr = short_axis[2 * block], hi = short_axis[2 * block + 1];
             ROW_LAST(ROW_WIENER)
         }
         ROW_MIDDLE_BACK(ROW_BACK)
@@ -467,18 +478,19 @@ restore_frame(
     __global stored        *filtered,
     __global OUT_TYPE      *image,
     __global const vec     *filter,
-    __global const real    *long_axis,
-    __global const vec     *short_axis,
+    __global const real    *otf,
+    __global const int     *bin,
     __global const int     *position,
     __global const real    *column_turns,
     __global const real    *column_blend,
     __global const real    *row_turns,
     __global const real    *row_blend,
     __global int           *tasks,
-    const int first, const int last,
+    const int first, const int last, const int otf_from,
     const real noise, const real scale)
 {
     vec work[WORK];
+    real along[2 * NX];
     const int workers = get_global_size(0), self = get_global_id(0);
     for (int step = first; step < last; ++step) {
         if (step > first) {
@@ -486,6 +498,11 @@ restore_frame(
             while (*(volatile __global int *)DONE(step - 1) < before) {}
             atomic_add(DONE(step - 1), 0);      // what was written before the count is seen after it
         }
+        if (step == 1 && !filter)
+            for (int x = 0; x < NX; ++x) {
+                along[2 * x] = WIENER_LIFT * otf[2 * (otf_from + bin[x])];
+                along[2 * x + 1] = WIENER_LIFT * otf[2 * (otf_from + bin[x]) + 1];
+            }
         const int count = step == 1 ? SLOTS / LANES : STRIPS;
         for (int turn = 0; turn < workers; ++turn) {
             const int owner = (self + turn) % workers;
@@ -495,8 +512,8 @@ restore_frame(
                 if (step == 0)
                     restore_columns_forward(work, task, frame, spectrum, position, column_turns, column_blend);
                 else if (step == 1)
-                    restore_rows(work, task, spectrum, filtered, filter, long_axis, short_axis, row_turns,
-                                 row_blend, noise, scale);
+                    restore_rows(work, task, spectrum, filtered, filter, along, otf + 2 * otf_from, bin + NX,
+                                 row_turns, row_blend, noise, scale);
                 else
                     restore_columns_inverse(work, task, filtered, image, position, column_turns);
                 mem_fence(CLK_GLOBAL_MEM_FENCE);

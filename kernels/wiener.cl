@@ -12,29 +12,21 @@
 //             else                (shorts / WIENER_BLOCK, longs, 2, WIENER_BLOCK) real: blocks of the axis of which
 //                                 half is held (x, or y where WIENER_HALF_ROWS), and the whole of the other
 //   long_frequency (longs) int, short_frequency (shorts) int   frequency at each place of the two; -1: none, G = 0
-//   long_axis (longs, 2) real, short_axis (shorts / WIENER_BLOCK, 2, WIENER_BLOCK) real   H along each, in that
-//             order, times WIENER_LIFT: what the restoration forms G from in registers
 //   ny, nx    padded frame            scale: 1, or what the transforms leave undone
 //
-// One work-item a value; wiener_pair: one of each axis. No local memory, no barriers.
-// wiener_axes and wiener_pair take the real part at the Nyquist index of each even axis: the half spectrum of a
-// real image has no room for its sign, and a complex value there would shift that frequency by a phase of its own.
+// One work-item a value. No local memory, no barriers.
+// wiener_axes takes the real part at the Nyquist index of each even axis: the half spectrum of a real image has no
+// room for its sign, and a complex value there would shift that frequency by a phase of its own.
 // Error: below 4 eps of |G| in float and double where H is exact (PoCL and Intel's runtime).
 
 #include "complex.h"
+#include "wiener_lift.h"
 
 #ifndef WIENER_BLOCK
 #define WIENER_BLOCK 0
 #endif
 #ifndef WIENER_HALF_ROWS
 #define WIENER_HALF_ROWS 0
-#endif
-
-// |H|^2 underflows long before H does, so both factors of H are scaled up by an exact power of two first.
-#if REAL_IS_DOUBLE
-#define WIENER_LIFT 1.427247692705959881e45      // 2^150
-#else
-#define WIENER_LIFT 1048576.0f                   // 2^20
 #endif
 
 // G of a lifted H.
@@ -95,32 +87,6 @@ __kernel void wiener_axes(
     wiener_gain(cplx_mul(wiener_axis(h_rows + rows_from, Y, ny), wiener_axis(h_cols + cols_from, X, nx)),   \
                 WIENER_NOISE(Y, X), scale)
     WIENER_FORM(WIENER_OF_AXES)
-}
-
-__kernel void wiener_pair(
-    __global const cplx *restrict h_rows,
-    __global const cplx *restrict h_cols,
-    __global const int  *restrict long_frequency,
-    __global const int  *restrict short_frequency,
-    __global real       *restrict long_axis,
-    __global real       *restrict short_axis,
-    const int ny, const int nx, const int rows_from, const int cols_from, const int longs, const int shorts)
-{
-    const int i = get_global_id(0), block = WIENER_BLOCK ? WIENER_BLOCK : 1;
-    __global const cplx *h_long = WIENER_HALF_ROWS ? h_cols + cols_from : h_rows + rows_from;
-    __global const cplx *h_short = WIENER_HALF_ROWS ? h_rows + rows_from : h_cols + cols_from;
-    if (i < longs) {
-        const cplx h = wiener_axis(h_long, long_frequency[i], WIENER_HALF_ROWS ? nx : ny);
-        long_axis[2 * i] = h.x;
-        long_axis[2 * i + 1] = h.y;
-    }
-    if (i < shorts) {
-        const int frequency = short_frequency[i], at = i / block * 2 * block + i % block;
-        cplx h = (cplx)(0, 0);
-        if (frequency >= 0) h = wiener_axis(h_short, frequency, WIENER_HALF_ROWS ? ny : nx);
-        short_axis[at] = h.x;
-        short_axis[at + block] = h.y;
-    }
 }
 
 __kernel void wiener_spectrum(

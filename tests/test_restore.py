@@ -16,6 +16,7 @@ from adof_cl.device import Device
 from adof_cl.errors import InputError
 from adof_cl.fft_passes import Passes, cost_of, radices_of
 from adof_cl.optics import OpticalSystem
+from adof_cl.otf_table import OtfTable
 from adof_cl.padding import good_size, padded_frame, padded_shape
 from adof_cl.restore import Restore
 
@@ -115,6 +116,23 @@ def test_an_image_does_not_depend_on_which_work_items_take_its_tasks(
     for turn in range(200):
         for each in (plan, second):
             np.testing.assert_array_equal(each.restore(frames[turn % 4]), wanted[turn % 4])
+
+
+def test_a_filter_follows_its_table(device: Device, family: str) -> None:
+    plan = plan_of(device, family)
+    table = OtfTable(device, OpticalSystem(), plan.padded_shape, entries=2)
+    frame = random_frame(SHAPE)
+    table.update([(20, 10), (30, -5)])
+    plan.set_filter_table(table.out, 0.02, entry=1)
+    before = plan.restore(frame)
+    table.update([(30, -5), (20, 10)])
+    after = plan.restore(frame)
+    plan.set_filter_table(table.out, 0.02, entry=0)
+    np.testing.assert_array_equal(plan.restore(frame), before)
+    assert not np.array_equal(after, before)
+    rows, columns = table.axes(1)
+    wanted = reference.restore(frame, reference.wiener_of_axes(rows, columns, 0.02), plan.padded_shape)
+    assert relative_l2(after, wanted) <= tolerances.restore_relative_l2("float32")
 
 
 def test_an_image_larger_than_the_caches_is_streamed_and_the_same(device: Device) -> None:

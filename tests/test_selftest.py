@@ -47,7 +47,8 @@ SLIPS = [
     ("psf.cl", "psf_fft", "along_rows ? 1 : m, m, s, j, sign", "along_rows ? 1 : m, m, s, j, -sign"),
     ("psf.cl", "psf_intensity", "psf[i] = value.x;", "psf[i] = value.x * REAL_C(1.00001);"),
     ("wiener.cl", "wiener_axes", "wiener_axis(h_cols + cols_from, X, nx)),", "wiener_axis(h_rows, X, nx)),"),
-    ("wiener.cl", "wiener_pair", "h_long, long_frequency[i]", "h_long, i"),
+    ("restore_lanes.cl", "restore_frame", "bin + NX,", "bin,"),
+    ("restore_groups.cl", "restore_columns", "bin[NY + block", "bin[block"),
     (
         "wiener.cl",
         "wiener_spectrum",
