@@ -105,10 +105,12 @@ def _levels(found: Array, wanted: NDArray[np.uint8]) -> float:
     return float(apart.max()) if np.mean(apart > 0) < 5e-3 else math.inf
 
 
-def _levels_of_halves(found: Array, wanted: NDArray[np.uint8]) -> float:
+def _levels_of_halves(found: Array, wanted: NDArray[np.float64]) -> float:
     """Largest difference in grey levels; infinite when the whole is off by more than halves promise."""
-    apart = found.astype(float) - wanted
-    return float(np.abs(apart).max()) if _relative(found.astype(float), wanted) <= 3e-3 else math.inf
+    apart = found - np.clip(wanted, 0, 255)
+    beyond_rounding = max(float(np.mean(apart**2)) - 1 / 12, 0.0)
+    fits = math.sqrt(beyond_rounding) <= 3e-3 * math.sqrt(float(np.mean(wanted**2)))
+    return float(np.abs(apart).max()) if fits else math.inf
 
 
 def _family(device: Device) -> str:
@@ -148,7 +150,7 @@ def _restore_ours(device: Device, size: Shape, kind: str, name: str = "adof-cl")
         if kind == "uint8":
             return _levels(out.download(), _bytes(wanted))
         if kind == "uint8 halves":
-            return _levels_of_halves(out.download(), _bytes(wanted))
+            return _levels_of_halves(out.download(), wanted)
         return _relative(out.download(), wanted)
 
     padded = plan.padded_shape

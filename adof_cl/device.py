@@ -244,17 +244,18 @@ class DeviceArray:
             self._leave(self.device.queue, self._leaving)
         return self
 
-    def begin_download(self) -> None:
+    def begin_download(self, written: cl.Event | None = None) -> None:
         """Start the copy that the next `download` returns, after everything enqueued before.
 
-        Until it is downloaded nothing may be enqueued that writes the array.
+        Until it is downloaded nothing may be enqueued that writes the array. `written`: the event of the last
+        launch, where the caller has it; it saves a command.
         """
         host, self._host = self._host, None
         if host is None:
             host = self.device.host_array(self.shape, self.dtype)
         computed = None
         if self.device.copies_apart:
-            computed = [cl.enqueue_marker(self.device.queue)]
+            computed = [written or cl.enqueue_marker(self.device.queue)]
             self.device.queue.flush()
         queue = self.device.download_queue
         self._arrival = cl.enqueue_copy(queue, host, self.buffer, is_blocking=False, wait_for=computed), host
@@ -330,9 +331,9 @@ class SharedArray(DeviceArray):
         np.copyto(self._shared, values)
         return self
 
-    def begin_download(self) -> None:
-        """Mark what the next `download` waits for: everything enqueued before."""
-        self._arrival = cl.enqueue_marker(self.device.queue), self._shared
+    def begin_download(self, written: cl.Event | None = None) -> None:
+        """Mark what the next `download` waits for: everything enqueued before, or `written`."""
+        self._arrival = written or cl.enqueue_marker(self.device.queue), self._shared
         self.device.queue.flush()
 
     def download(self, out: NDArray[Any] | None = None) -> NDArray[Any]:

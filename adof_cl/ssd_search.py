@@ -333,10 +333,10 @@ class SsdSearch:
             raise InputError(
                 f"template {min(self._missing)} was never set: call set_templates before the search"
             )
-        self._search()
+        done = self._search()
         if self._best:
-            self._best()
-        self._records.begin_download()
+            done = self._best()
+        self._records.begin_download(done)
 
     @property
     def found(self) -> bool:
