@@ -33,7 +33,7 @@ Array = NDArray[Any]
 NSR = 0.01
 ALPHA_RAD, PSI_RAD = 20.0, 10.0
 _TEMPLATE, _WINDOW = (20, 20), (64, 64)
-_PAIRS = 64
+_PAIRS = 512
 
 
 # ---- inputs and answers ---------------------------------------------------------------------------------

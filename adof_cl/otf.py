@@ -21,6 +21,7 @@ FAMILIES = ("lanes", "groups")
 
 _GROUP = 64
 _ITEMS_PER_UNIT = 4  # so that no core waits long for the last
+_LIMITS_RAD = np.array([ALPHA_LIMIT_RAD, PSI_LIMIT_RAD])
 _PAIR_BYTES = 896  # by value: with the other arguments within the 1024 that every device takes
 
 
@@ -202,8 +203,8 @@ class Otf1d:
             raise InputError(
                 f"pairs has shape {wanted.shape}: {self._pairs_shape} of (alpha, psi) was wanted, as planned"
             )
-        for alpha, psi in wanted.tolist():
-            if not (abs(alpha) <= ALPHA_LIMIT_RAD and abs(psi) <= PSI_LIMIT_RAD):
+        if not (np.abs(wanted) <= _LIMITS_RAD).all():
+            for alpha, psi in wanted.tolist():
                 require_envelope(alpha, psi)  # says what is wrong
         turns = wanted * (1 / (2 * math.pi))
         parts = self._turns[: len(turns)]

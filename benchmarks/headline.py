@@ -62,8 +62,8 @@ def block() -> str:
     reports = [Report.read(path) for path in sorted((TREE / "benchmarks" / "results").glob("*.json"))]
     introduction = (
         "`adof bench` checks every result against float64, then lets ours and other libraries take turns "
-        "in one process; a ratio above 1 means ours is faster. Where the machine has other work to do, threads "
-        "that wait for each other suffer most (FFTW's); brackets are quartiles. "
+        "in one process; a ratio above 1 means ours is faster. Where the machine has other work to do, "
+        "threads that wait for each other suffer most (FFTW's); brackets are quartiles. "
         "[benchmarks/](benchmarks/README.md) says how it was measured and keeps every number."
     )
     reports.sort(key=lambda report: report.device["platform"] != "Portable Computing Language")  # the default

@@ -58,13 +58,16 @@ run() {
     for size in 512x400 659x494 1024x1024 2048x2048; do
         step "parts-$size" "$venv/bin/python" benchmarks/chain_parts.py --size "$size"
     done
+    for size in 512x400 1024x1024; do
+        step "batch-$size" "$venv/bin/python" benchmarks/batch.py --size "$size"
+    done
     step bench "$venv/bin/adof" bench --json "$out/bench.json" --plot "$out/bench.png"
     step scaling "$venv/bin/python" benchmarks/scaling.py --json "$out/scaling.json" --plot "$out/scaling.png"
     step streaming "$venv/bin/python" benchmarks/streaming.py
     step tests "$venv/bin/pytest" -q -m "kernel and not slow" -p no:cacheprovider \
         --ignore=tests/test_loop.py --ignore=tests/test_survey.py --ignore=tests/test_cli_run.py \
         --ignore-glob='tests/test_*bench.py'
-    cat "$out"/devices.txt "$out"/parts-*.txt "$out"/bench.txt "$out"/scaling.txt
+    cat "$out"/devices.txt "$out"/parts-*.txt "$out"/batch-*.txt "$out"/bench.txt "$out"/scaling.txt
     [ ${#failed[@]} -eq 0 ] || {
         echo "failed: ${failed[*]}"
         return 1
