@@ -140,7 +140,7 @@ def _lanes(
         True, lanes, slots, (strips, slots, 4, lanes), strips, 1, 1,
         {
             "VECTOR_BYTES": vector, "STRIPS": strips, "HELD": held, "SLOTS": slots,
-            "STREAM_IMAGE": int(moved > 1 and whole_lines),
+            "STREAM_SPECTRUM": int(moved > 1), "STREAM_IMAGE": int(moved > 1 and whole_lines),
         },
     )  # fmt: skip
 

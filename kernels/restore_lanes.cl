@@ -31,9 +31,9 @@
 //
 // Defines: VECTOR_BYTES; ROWS, COLS frame; NX, NY padded; STRIPS of columns; HELD frequencies of a column of the
 // frame, SLOTS that number in whole blocks of LANES; IN_TYPE, OUT_TYPE; OUT_LIMIT the largest code of an integer
-// output, 0 for a real one; STREAM_IMAGE: the caches cannot hold it and its strips are whole lines; HALF_SPECTRUM;
-// STORED_LEVEL grey levels to a stored one, 1 but for half. The passes come from the generated lists: ROW_FIRST, then
-// ROW_MIDDLE and ROW_LAST in each part of ROW_INNER samples; likewise columns.
+// output, 0 for a real one; STREAM_SPECTRUM: the caches cannot hold it; STREAM_IMAGE: nor this, and its strips are
+// whole lines; HALF_SPECTRUM; STORED_LEVEL grey levels to a stored one, 1 but for half. The passes come from the
+// generated lists: ROW_FIRST, then ROW_MIDDLE and ROW_LAST in each part of ROW_INNER samples; likewise columns.
 //
 // One work-item a processor core, each taking tasks until there are none; local size 1; no local memory, no barriers.
 // A launch of one step is safe on any device; of several where work-items of one launch see each other's global
@@ -81,9 +81,14 @@ typedef vec stored;
 
 // Stores past the caches, to lines that are written whole.
 #if __has_builtin(__builtin_nontemporal_store)
-#define STREAM(P, V) __builtin_nontemporal_store(V, (__global JOIN(OUT_TYPE, LANES) *)(P))
+#define STREAM(P, V) __builtin_nontemporal_store(V, P)
 #else
-#define STREAM(P, V) *(__global JOIN(OUT_TYPE, LANES) *)(P) = V
+#define STREAM(P, V) *(P) = V
+#endif
+#if STREAM_SPECTRUM && !HALF_SPECTRUM
+#define PUT_FAR(P, I, V) STREAM((P) + (I), V)
+#else
+#define PUT_FAR(P, I, V) PUT(P, I, V)
 #endif
 
 // ---- pixels -----------------------------------------------------------------------------------------------
@@ -107,7 +112,7 @@ ALWAYS_INLINE void restore_store(__global OUT_TYPE *image, const int row, const 
 {
     __global OUT_TYPE *to = image + (size_t)row * COLS + col;
     if (STREAM_IMAGE)
-        STREAM(to, CONVERT(restore_level(v), OUT_TYPE));
+        STREAM((__global JOIN(OUT_TYPE, LANES) *)to, CONVERT(restore_level(v), OUT_TYPE));
     else
         *(__global out_vec *)to = CONVERT(restore_level(v), OUT_TYPE);
 }
@@ -339,12 +344,12 @@ STEP void restore_columns_forward(vec *work, const int strip, __global const IN_
     __global stored *out = spectrum + 4 * (size_t)SLOTS * strip;
     for (int i = 0; i < HELD; ++i) {
         const vec *p = work + 2 * position[i], *q = work + 2 * position[SLOTS + i];
-        PUT(out, 4 * i, SCALED(p[0] + q[0]));
-        PUT(out, 4 * i + 1, SCALED(p[1] - q[1]));
-        PUT(out, 4 * i + 2, SCALED(p[1] + q[1]));
-        PUT(out, 4 * i + 3, SCALED(q[0] - p[0]));
+        PUT_FAR(out, 4 * i, SCALED(p[0] + q[0]));
+        PUT_FAR(out, 4 * i + 1, SCALED(p[1] - q[1]));
+        PUT_FAR(out, 4 * i + 2, SCALED(p[1] + q[1]));
+        PUT_FAR(out, 4 * i + 3, SCALED(q[0] - p[0]));
     }
-    for (int i = 4 * HELD; i < 4 * SLOTS; ++i) PUT(out, i, (vec)(0));
+    for (int i = 4 * HELD; i < 4 * SLOTS; ++i) PUT_FAR(out, i, (vec)(0));
 }
 
 // LANES vertical frequencies there and back; the columns of the padding are made here. `along` is H along x, in the
