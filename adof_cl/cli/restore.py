@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from adof_cl.device import Device
     from adof_cl.image_files import Image, ImageStack
     from adof_cl.optics import Mask, OpticalSystem
+    from adof_cl.restoration_quality import RestorationQuality
     from adof_cl.restore import Restore
 
 _OUTLIER_SIGMAS = 10
@@ -133,7 +134,7 @@ def restore(
     print(
         f"{target}: {stack.pages} page{'s' * (stack.pages > 1)} of {stack.shape[0]} x {stack.shape[1]} "
         f"{stack.dtype}, padded to {job.plan.padded_shape[0]} x {job.plan.padded_shape[1]}, nsr {job.noise}, "
-        f"{time.perf_counter() - started:.1f} s on {opened.facts}"
+        f"{job.promise()}, {time.perf_counter() - started:.1f} s on {opened.facts}"
     )
 
 
@@ -145,6 +146,16 @@ class _Job:
     offset: float
     repair: bool
     noise: str
+    quality: RestorationQuality
+    object_pitch_um: float | None = None
+
+    def promise(self) -> str:
+        """Say how loud noise and how fine detail will be."""
+        periods = self.quality.half_contrast_period_xy_px
+        detail = f"half contrast at lines of {periods.max():.1f} px"
+        if self.object_pitch_um is not None:
+            detail += f" ({self.quality.half_contrast_period_um(self.object_pitch_um):.1f} µm)"
+        return f"noise x {self.quality.noise_gain:.2f}, {detail}"
 
     def planes(self, stack: ImageStack) -> Iterator[NDArray[np.float32]]:
         for page in stack:
@@ -159,6 +170,7 @@ def _measured(
 
     from adof_cl.errors import InputError
     from adof_cl.image_files import read_image
+    from adof_cl.restoration_quality import restoration_quality
     from adof_cl.restore import Restore
     from adof_cl.wiener import WienerFilter, psf_otf
 
@@ -180,7 +192,8 @@ def _measured(
     ratio = _ratio(nsr, _light(first, dark, wide), otf, plan.padded_shape)
     wiener = WienerFilter(device, plan.padded_shape, precision=precision)
     plan.set_filter(wiener.from_otf(otf, ratio))
-    return _Job(plan, dark, wide, _described(ratio))
+    quality = restoration_quality(otf, ratio, plan.padded_shape)
+    return _Job(plan, dark, wide, _described(ratio), quality)
 
 
 def _computed(
@@ -199,6 +212,7 @@ def _computed(
 
     from adof_cl.optics import require_finite
     from adof_cl.otf import Otf1d
+    from adof_cl.restoration_quality import restoration_quality
     from adof_cl.restore import Restore
 
     require_finite(depth_um=depth_um)
@@ -216,7 +230,8 @@ def _computed(
     otf = np.outer(axes[0], axes[1][: plan.padded_shape[1] // 2 + 1])
     ratio = _ratio(nsr, _light(first, dark, repair=False), otf, plan.padded_shape)
     plan.set_filter_axes(axes[0], axes[1], ratio)
-    return _Job(plan, dark, False, _described(ratio))
+    quality = restoration_quality(otf, ratio, plan.padded_shape)
+    return _Job(plan, dark, False, _described(ratio), quality, optics.object_pitch_um)
 
 
 def _ratio(
