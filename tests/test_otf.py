@@ -271,10 +271,11 @@ def test_defocus_shifts_a_coded_image_as_predicted() -> None:
     assert pixels == pytest.approx(optics.shift_px(alpha, psi), rel=0.05)
 
 
-def test_several_pairs_in_one_call_equal_one_by_one(device: Device) -> None:
-    pairs = [(53.5, 15.0), (-3.0, 60.0), (0.0, 0.0)]
-    together = Otf1d(device, U, pairs=3)(pairs).download()
-    alone = Otf1d(device, U)
+@pytest.mark.parametrize("count", [3, 20])
+def test_several_pairs_in_one_call_equal_one_by_one(device: Device, precision: str, count: int) -> None:
+    pairs = [(53.5 / 1.3**k, 15.0 * (k % 3 - 1)) for k in range(count - 1)] + [(0.0, 0.0)]
+    together = Otf1d(device, U, pairs=count, precision=precision)(pairs).download()
+    alone = Otf1d(device, U, precision=precision)
     for row, pair in zip(together, pairs, strict=True):
         assert np.array_equal(row, alone.evaluate(*pair))
 
