@@ -54,7 +54,7 @@ run() {
         fi
     }
     step devices "$venv/bin/adof" devices
-    step selftest "$venv/bin/adof" selftest
+    step selftest "$venv/bin/adof" selftest --small
     for size in 512x400 659x494 1024x1024 2048x2048; do
         step "parts-$size" "$venv/bin/python" benchmarks/chain_parts.py --size "$size"
     done
