@@ -5,5 +5,6 @@ link.py              bytes to a device and back
 safety.py            enable latch, limits, watch on motion
 stage.py             a stage in front of any controller
 gcs.py               PI controllers by GCS 2.0
+picomotor.py         New Focus Picomotor 8742
 emulators/           controllers that speak the wire
 """

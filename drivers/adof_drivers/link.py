@@ -14,7 +14,7 @@ import itertools
 import select
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from threading import Lock
 from types import TracebackType
 from typing import Any, Protocol
@@ -279,12 +279,14 @@ class Link:
         whole: Callable[[bytes], bool],
         *,
         since: int | None = None,
-        timeout_s: float | None = None,
+        first: Sequence[bytes] = (),
     ) -> bytes:
         """Send a request and return its reply, every byte of it.
 
         Parameters
         ----------
+        first
+            Commands without a reply that go before it, each by itself.
         whole
             Whether the bytes so far are a whole reply.
         since
@@ -304,33 +306,34 @@ class Link:
             if since is not None and self._interrupts != since:
                 raise StoppedError(f"{self.transport.name} was stopped meanwhile: nothing was sent")
             try:
-                return self._exchange(request, whole, since, timeout_s or self.timeout_s)
+                return self._exchange((*first, request), whole, since)
             except DriverError as failure:
                 self._broken = str(failure)
                 raise
 
     def _exchange(
-        self, request: bytes, whole: Callable[[bytes], bool], since: int | None, timeout_s: float
+        self, requests: Sequence[bytes], whole: Callable[[bytes], bool], since: int | None
     ) -> bytes:
         if not isinstance(self.transport, UsbTransport) and (stray := self.transport.read_some(0.0)):
             raise ReplyError(
                 f"{self.transport.name} sent {stray[:40]!r} unasked: its replies are out of step"
             )
-        self.transport.write(request)
+        for request in requests:
+            self.transport.write(request)
         if since is not None and self._interrupts != since:
             self.transport.write(self._interrupt)
-        deadline = time.monotonic() + timeout_s
+        deadline = time.monotonic() + self.timeout_s
         reply = b""
         while not whole(reply):
             left_s = deadline - time.monotonic()
             if left_s <= 0:
                 raise ReplyTimeoutError(
-                    f"{self.transport.name} gave {reply[-40:]!r} to {request[:60]!r} and no more within "
-                    f"{timeout_s:g} s: check cable and power"
+                    f"{self.transport.name} gave {reply[-40:]!r} to {requests[-1][:60]!r} and no more within "
+                    f"{self.timeout_s:g} s: check cable and power"
                 )
             reply += self.transport.read_some(left_s)
             if len(reply) > LONGEST_REPLY:
-                raise ReplyError(f"{self.transport.name} does not end its reply to {request[:60]!r}")
+                raise ReplyError(f"{self.transport.name} does not end its reply to {requests[-1][:60]!r}")
         return reply
 
     def discard(self, *, quiet_s: float = 0.02, limit_s: float = 0.5) -> None:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
+from adof_drivers.emulators.engine import Engine
 from adof_drivers.emulators.faults import FaultSchedule
 from adof_drivers.emulators.motion import Motor
 
@@ -48,25 +48,13 @@ _REFERENCING_S = 0.5
 _LONGEST_LINE = 1024
 
 
-class Disconnected(Exception):  # noqa: N818  (an event of the wire, not an error of the engine)
-    """The schedule says that the connection breaks here."""
-
-
-@dataclass(frozen=True)
-class Reply:
-    """Bytes to send, and how long to hold them back."""
-
-    data: bytes
-    delay_s: float = 0.0
-
-
 class _Refused(Exception):  # noqa: N818
     def __init__(self, code: int) -> None:
         super().__init__(code)
         self.code = code
 
 
-class GcsEngine:
+class GcsEngine(Engine):
     """Axes 0 to 25 mm, 5 mm/s, 50 mm/s^2, servo off and not referenced.
 
     Parameters
@@ -78,6 +66,9 @@ class GcsEngine:
     command_set
         What CSV? says.
     """
+
+    singles = b"\x05\x07\x18"
+    limit_code = 7
 
     def __init__(
         self,
@@ -92,13 +83,9 @@ class GcsEngine:
         acceleration: float = 50.0,
     ) -> None:
         self.identity, self.command_set = identity, command_set
-        self.received: list[bytes] = []
-        self._now_s = now_s
-        self.faults = faults or FaultSchedule()
+        super().__init__(now_s, faults)
         self._travel, self._speed, self._acceleration = travel, speed, acceleration
         self._names = tuple(axes)
-        self._buffer = b""
-        self.motors: dict[str, Motor] = {}
         self.power_cycle()
 
     def power_cycle(self) -> None:
@@ -115,84 +102,18 @@ class GcsEngine:
         self._error = 0
         self._ready_s = -math.inf
 
-    @property
-    def position(self) -> dict[str, float]:
-        """Where the axes are, mm: truth."""
-        self._advance()
-        return {name: motor.position for name, motor in self.motors.items()}
+    def _force(self, code: int) -> None:
+        if code == -1024:  # what a servo says that gave up
+            self._servo = dict.fromkeys(self._names, False)
+            self._halt(self._names)
+        self._error = code
 
-    @property
-    def moving(self) -> bool:
-        """Whether anything moves: truth."""
-        self._advance()
-        return any(motor.moving for motor in self.motors.values())
-
-    def feed(self, data: bytes) -> list[Reply]:
-        """Take bytes, however cut, and return the replies they bring about.
-
-        Raises
-        ------
-        Disconnected
-            The schedule breaks the connection here.
-        """
-        replies = []
-        for byte in data:
-            if byte in (5, 7, 24):  # single bytes act at once, even inside a line
-                replies.append(self._answer(bytes([byte])))
-            elif byte == 10:
-                line, self._buffer = self._buffer, b""
-                replies.append(self._answer(line))
-            elif byte not in (0, 13) and len(self._buffer) < _LONGEST_LINE:  # some clients pad with NUL
-                self._buffer += bytes([byte])
-        return [reply for reply in replies if reply.data]
-
-    def disconnected(self) -> None:
-        """The client has gone: half a line is forgotten. What moves goes on."""
-        self._buffer = b""
-
-    def _advance(self) -> None:
-        now_s = self._now_s()
-        for motor in self.motors.values():
-            motor.advance(now_s)
-
-    def _answer(self, line: bytes) -> Reply:
-        self._advance()
-        self.received.append(line)
-        delay_s, lost, garbled, forced = 0.0, False, False, None
-        for fault in self.faults.due():
-            match fault.kind:
-                case "delay":
-                    delay_s += fault.amount
-                case "lose":
-                    lost = True
-                case "garble":
-                    garbled = True
-                case "error":
-                    forced = int(fault.amount)
-                case "disconnect":
-                    raise Disconnected
-                case "stick":
-                    for motor in self.motors.values():
-                        motor.stuck = True
-                case "limit":
-                    for motor in self.motors.values():
-                        motor.place(motor.position)
-                    forced = 7
-                case "power_cycle":
-                    self.power_cycle()
-        if forced is not None:
-            # -1024 is what a servo says that gave up.
-            if forced == -1024:
-                self._servo = dict.fromkeys(self._names, False)
-                self._halt(self._names)
-            self._error = forced
+    def _answer(self, line: bytes) -> bytes:
         try:
-            data = self._act(line)
+            return self._act(line)
         except _Refused as refusal:
-            self._error, data = refusal.code, b""
-        if garbled:
-            data = bytes(byte ^ 0x15 if byte != 10 else byte for byte in data)
-        return Reply(b"" if lost else data, delay_s)
+            self._error = refusal.code
+            return b""
 
     def _act(self, line: bytes) -> bytes:
         if line == b"\x05":

@@ -17,22 +17,9 @@ import time
 from collections import deque
 from ipaddress import ip_address
 from types import TracebackType
-from typing import Protocol
 
-from adof_drivers.emulators.gcs import Disconnected, Reply
+from adof_drivers.emulators.engine import Disconnected, Engine
 from adof_drivers.errors import RequestError
-
-
-class Engine(Protocol):
-    """A device on no wire yet."""
-
-    def feed(self, data: bytes) -> list[Reply]:
-        """Take bytes, give replies."""
-        ...
-
-    def disconnected(self) -> None:
-        """Forget half a line."""
-        ...
 
 
 class Served:

@@ -13,8 +13,7 @@ from typing import Any
 import usb.backend
 import usb.core
 
-from adof_drivers.emulators.gcs import Disconnected
-from adof_drivers.emulators.serve import Engine
+from adof_drivers.emulators.engine import Disconnected, Engine
 
 
 class UsbBus(usb.backend.IBackend):  # type: ignore[misc]  # pyusb has no types
