@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -11,6 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adof_drivers.emulators.faults import Fault
+from adof_drivers.emulators.gcs import GcsEngine
+from adof_drivers.emulators.serve import Served
 from adof_drivers.errors import (
     ControllerError,
     DriverError,
@@ -344,3 +348,36 @@ def never_arrives(rig: Rig) -> None:
     rig.clock.wait(10.0)
     assert not rig.engine.moving
     assert rig.engine.position["1"] < 19.0
+
+
+def test_a_stage_whose_program_is_killed_stops_by_itself_where_its_velocity_expires() -> None:
+    program = """
+import sys
+from adof_drivers.gcs import GcsController
+from adof_drivers.link import Link, TcpTransport
+from adof_drivers.safety import StageAxis
+from adof_drivers.stage import Stage
+link = Link(TcpTransport("127.0.0.1", int(sys.argv[1])))
+stage = Stage(GcsController(link), {"x": StageAxis("1", "um", 1000.0, 4000.0, 0.1)})
+stage.latch.operator(False)
+stage.latch.operator(True)
+while True:
+    stage.set_velocity({"x": 1000.0}, expires_s=0.25)
+    print("driving", flush=True)
+"""
+    engine = GcsEngine(("1",), now_s=time.monotonic)
+    engine.feed(b"SVO 1 1\nFRF\nERR?\n")
+    with Served.tcp(engine) as served:
+        client = subprocess.Popen([sys.executable, "-c", program, str(served.port)], stdout=subprocess.PIPE)
+        assert client.stdout is not None
+        for _ in range(20):
+            assert client.stdout.readline() == b"driving\n"
+        client.kill()
+        client.communicate()
+        killed_at = engine.position["1"]
+        assert engine.moving
+        while engine.moving:
+            threading.Event().wait(0.001)
+        # 1 mm/s for a quarter of a second at most; 1 mm/s is braked on 10 um, before the target.
+        assert 0 < engine.position["1"] - killed_at <= 0.25
+        assert not [line for line in engine.received if line == b"\x18"]
