@@ -15,8 +15,21 @@ import typer
 
 from adof_cl import __version__
 from adof_cl.errors import AdofError
+from adof_drivers.errors import DriverError
 
-COMMANDS: tuple[str, ...] = ("run", "devices", "phase", "otf", "psf", "dof", "restore", "selftest", "bench")
+COMMANDS: tuple[str, ...] = (
+    "run",
+    "devices",
+    "phase",
+    "otf",
+    "psf",
+    "dof",
+    "restore",
+    "rig",
+    "emulate",
+    "selftest",
+    "bench",
+)
 """Modules of this package, in the order `adof --help` lists them."""
 
 
@@ -55,7 +68,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run `adof`; exits with 0, 1 (a check failed), 2 (refused input) or 130 (interrupted)."""
     try:
         application()(args=arguments, standalone_mode=True)
-    except AdofError as refusal:
+    except (AdofError, DriverError) as refusal:
         print(f"adof: {refusal}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:

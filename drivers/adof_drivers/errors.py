@@ -7,3 +7,47 @@ class DriverError(Exception):
 
 class EndOfSequenceError(DriverError):
     """A replayed sequence has no further frame."""
+
+
+class RequestError(DriverError):
+    """The caller asked for something that is not there or is no number; nothing was sent."""
+
+
+class LimitError(DriverError):
+    """A move beyond a limit; nothing moved."""
+
+
+class LinkError(DriverError):
+    """The connection is gone, refused, or no longer in step."""
+
+
+class ReplyTimeoutError(LinkError):
+    """No whole reply within the time-out."""
+
+
+class ReplyError(LinkError):
+    """A reply that the protocol does not allow."""
+
+
+class DialectError(DriverError):
+    """The device speaks, but is not the kind that was wanted."""
+
+
+class ControllerError(DriverError):
+    """The controller refused. `code` is its own number."""
+
+    def __init__(self, message: str, code: int) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class StoppedError(DriverError):
+    """A stop came between the command and its motion."""
+
+
+class NotArmedError(DriverError):
+    """Motion was asked for while the enable latch is open."""
+
+
+class FollowingError(DriverError):
+    """An axis is not where its command should have brought it."""
