@@ -1,4 +1,10 @@
 """Hardware. Knows nothing of adof_cl; the closed loop takes these devices by shape.
 
+camera.py            what a camera offers, and a watch over its frames
+camera_pair.py       two cameras paired by time
 image_sequence.py    a camera that replays PNG and TIFF files
+video_capture.py     cameras and videos that OpenCV opens
+gige.py              GigE Vision cameras
+basler.py            Basler cameras
+emulators/           devices that speak the real wire formats
 """

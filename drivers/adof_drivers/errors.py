@@ -7,3 +7,15 @@ class DriverError(Exception):
 
 class EndOfSequenceError(DriverError):
     """A replayed sequence has no further frame."""
+
+
+class FrameTimeoutError(DriverError):
+    """No usable frame came in time; the camera may still be there."""
+
+
+class DeviceLostError(DriverError):
+    """A device that was there no longer answers."""
+
+
+class FrozenFramesError(DriverError):
+    """A camera goes on counting but sends the same picture."""

@@ -1,0 +1,4 @@
+"""Devices that speak the real wire formats, so that drivers are proven without hardware.
+
+gige.py    a GigE Vision camera on UDP that serves the pictures it is given, with seeded faults
+"""
