@@ -6,5 +6,9 @@ image_sequence.py    a camera that replays PNG and TIFF files
 video_capture.py     cameras and videos that OpenCV opens
 gige.py              GigE Vision cameras
 basler.py            Basler cameras
+slm.py               what a modulator offers
+slm_window.py        a modulator that is a monitor
+phase_table.py       measured phase to codes, a vendor's correction to phase
+holoeye.py           HOLOEYE panels through their SDK
 emulators/           devices that speak the real wire formats
 """
