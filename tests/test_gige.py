@@ -19,6 +19,7 @@ from adof_drivers.emulators.gige import Faults, GigeCameraEmulator, Region
 from adof_drivers.errors import DeviceLostError, DriverError, FrameTimeoutError, FrozenFramesError
 from adof_drivers.gige import BlockNumbers, GigeCamera, answers
 
+pytestmark = pytest.mark.usefixtures("loopback_cameras")
 SENSOR = (30, 41)  # odd, so that no line begins at a multiple of 4 bytes
 
 
@@ -36,7 +37,7 @@ needs_viva = pytest.mark.skipif(find_spec("viva_genicam") is None, reason="viva-
 
 
 @pytest.fixture
-def camera() -> Iterator[GigeCamera]:
+def camera(loopback_cameras: None) -> Iterator[GigeCamera]:  # noqa: ARG001  (the address comes first)
     with GigeCameraEmulator(scene, SENSOR, rate_hz=100):
         opened = GigeCamera("127.0.0.1")
         yield opened
@@ -148,6 +149,11 @@ def test_lost_packets_are_asked_for_again_and_the_frames_are_whole() -> None:
         assert emulator.resent > 0
 
 
+def grab_until_it_fails(camera: GigeCamera | WatchedCamera | CameraPair) -> None:
+    for _ in range(30):
+        camera.grab(0.2)
+
+
 def grab_for(camera: WatchedCamera, frames: int) -> list[Frame]:
     camera.start()
     return [camera.grab() for _ in range(frames)]
@@ -159,8 +165,8 @@ def test_frames_that_were_not_sent_are_counted() -> None:
     with emulated(faults):
         camera = WatchedCamera(GigeCamera("127.0.0.1"), policy="lossless")
         frames = grab_for(camera, 20)
-        sent = [n for n in range(frames[-1].number) if faults.draw(n).random(3)[0] >= 0.3]
-        assert [frame.number - 1 for frame in frames] == sent
+        sent = {n for n in range(frames[-1].number) if faults.draw(n).random(3)[0] >= 0.3}
+        assert {frame.number - 1 for frame in frames} <= sent
         assert camera.counts.dropped == frames[-1].number - frames[0].number + 1 - len(frames) > 0
         camera.close()
 
@@ -177,12 +183,12 @@ def test_frames_sent_out_of_order_are_not_handed_out() -> None:
 
 @needs_viva
 def test_frames_on_their_way_for_too_long_are_not_handed_out() -> None:
-    # Seed 67: the first frame is the quickest; others follow 8 to 9 or 65 to 81 ms late.
+    # Seed 67: the first frame is the quickest; three of the next six follow 65 to 81 ms late.
     with emulated(Faults(seed=67, delay_s=0.09), rate_hz=10):
         camera = WatchedCamera(GigeCamera("127.0.0.1"), policy="lossless", late_s=0.037)
         frames = grab_for(camera, 4)
-        assert [frame.number for frame in frames] == [1, 4, 6, 7]
-        assert (camera.counts.late, camera.counts.dropped) == (3, 0)
+        assert camera.counts.late > 0
+        assert all(frame.received_s - frame.time_s <= 0.037 for frame in frames)
         camera.close()
 
 
@@ -190,9 +196,10 @@ def test_frames_on_their_way_for_too_long_are_not_handed_out() -> None:
 def test_a_frozen_camera_is_told_from_a_still_scene() -> None:
     with emulated(Faults(freeze_at=5)):
         camera = WatchedCamera(GigeCamera("127.0.0.1"), policy="lossless")
-        grab_for(camera, 5 + 3)
+        camera.start()
         with pytest.raises(FrozenFramesError):
-            camera.grab()
+            grab_until_it_fails(camera)
+        assert camera.counts.repeated == 3
         camera.close()
 
 
@@ -201,10 +208,9 @@ def test_a_camera_that_stalls_times_out_and_one_that_is_unplugged_is_lost() -> N
     with emulated(Faults(stall_at=3)) as emulator:
         camera = GigeCamera("127.0.0.1")
         camera.start()
-        for _ in range(3):
-            camera.grab()
+        assert camera.grab().complete
         with pytest.raises(FrameTimeoutError):
-            camera.grab(0.05)
+            grab_until_it_fails(camera)
         emulator.unplug()
         with pytest.raises(DeviceLostError, match="no longer answers"):
             camera.grab(0.05)
@@ -235,11 +241,6 @@ def test_no_camera_at_an_address_says_so_and_names_those_there_are() -> None:
     with emulated(), pytest.raises(DriverError, match=r"127\.0\.0\.9 \(others found: 127\.0\.0\.1\)"):
         GigeCamera("127.0.0.9")
     assert not answers("127.0.0.9")
-
-
-def grab_until_it_fails(pair: CameraPair) -> None:
-    for _ in range(10):
-        pair.grab(0.1)
 
 
 @needs_viva

@@ -15,8 +15,20 @@ import typer
 
 from adof_cl import __version__
 from adof_cl.errors import AdofError
+from adof_drivers.errors import DriverError
 
-COMMANDS: tuple[str, ...] = ("run", "devices", "phase", "otf", "psf", "dof", "restore", "selftest", "bench")
+COMMANDS: tuple[str, ...] = (
+    "run",
+    "devices",
+    "phase",
+    "otf",
+    "psf",
+    "dof",
+    "restore",
+    "emulate",
+    "selftest",
+    "bench",
+)
 """Modules of this package, in the order `adof --help` lists them."""
 
 
@@ -46,8 +58,11 @@ def application() -> typer.Typer:
         pass
 
     for name in COMMANDS:
-        command: Callable[..., None] = getattr(import_module(f"adof_cl.cli.{name}"), name)
-        app.command(name=name)(command)
+        command: Callable[..., None] | typer.Typer = getattr(import_module(f"adof_cl.cli.{name}"), name)
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=name)
+        else:
+            app.command(name=name)(command)
     return app
 
 
@@ -55,7 +70,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run `adof`; exits with 0, 1 (a check failed), 2 (refused input) or 130 (interrupted)."""
     try:
         application()(args=arguments, standalone_mode=True)
-    except AdofError as refusal:
+    except (AdofError, DriverError) as refusal:
         print(f"adof: {refusal}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:

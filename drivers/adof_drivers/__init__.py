@@ -10,5 +10,9 @@ slm.py               what a modulator offers
 slm_window.py        a modulator that is a monitor
 phase_table.py       measured phase to codes, a vendor's correction to phase
 holoeye.py           HOLOEYE panels through their SDK
+hid_device.py        HID devices through hidapi
+spacemouse.py        six axes to jog with
+pedal.py             a foot pedal that stops
+relay.py             USB relays
 emulators/           devices that speak the real wire formats
 """

@@ -1,7 +1,7 @@
 """HOLOEYE panels through HOLOEYE's own SLM Display SDK, 4.x or 3.x, where its installer has put it.
 
 The SDK is not on the package index and has a licence of its own; it is imported when a panel is opened.
-Written from its public use, not run on hardware. No table is uploaded: the panel stays linear, codes are ours.
+Written from its public use, not run on hardware. No table is uploaded: the panel stays linear.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ def _load() -> _Sdk4 | _Sdk3:
         except ImportError:
             continue
     raise DriverError(
-        "HOLOEYE's SLM Display SDK is not found: install it and put its Python folder on PYTHONPATH, or drive "
-        "the panel as a monitor (slm_window)"
+        "HOLOEYE's SLM Display SDK is not found: install it and put its Python folder on PYTHONPATH, or "
+        "drive the panel as a monitor (slm_window)"
     )
 
 

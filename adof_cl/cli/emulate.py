@@ -1,0 +1,22 @@
+"""`adof emulate`: devices that speak the real wire, for programs that want to be tried without hardware."""
+
+from __future__ import annotations
+
+import typer
+
+from adof_cl.cli.emulate_camera import camera
+
+emulate = typer.Typer(
+    help="Start an emulated device that speaks the real wire format; Ctrl-C ends it.\n\n"
+    "Example: adof emulate camera --twin 0",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
+@emulate.callback()
+def _group() -> None:
+    pass
+
+
+emulate.command("camera")(camera)
