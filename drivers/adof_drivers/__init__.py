@@ -10,6 +10,7 @@ slm.py               what a modulator offers
 slm_window.py        a modulator that is a monitor
 phase_table.py       measured phase to codes, a vendor's correction to phase
 holoeye.py           HOLOEYE panels through their SDK
+dlpc900.py           TI's pattern controller
 hid_device.py        HID devices through hidapi
 spacemouse.py        six axes to jog with
 pedal.py             a foot pedal that stops

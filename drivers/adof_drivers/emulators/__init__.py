@@ -1,5 +1,5 @@
 """Devices that speak the real wire formats, so that drivers are proven without hardware.
 
 gige.py    a GigE Vision camera on UDP that serves the pictures it is given, with seeded faults
-hid.py     SpaceMouse, pedal and relay board, as hidapi hands them out
+hid.py     SpaceMouse, pedal, relay board and DLPC900, as hidapi hands them out
 """

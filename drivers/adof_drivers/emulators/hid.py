@@ -102,3 +102,54 @@ class EmulatedRelay(EmulatedHid):
         """Answer serial number and state, after the report's number."""
         self._require_there()
         return [report_num, *b"ADOF1", 0, 0, self.bits][:max_length]
+
+
+class EmulatedDlpc900(EmulatedHid):
+    """TI's controller: status, version, display mode, patterns on and off.
+
+    Parameters
+    ----------
+    locked
+        Whether a video signal is there; without one it refuses patterns from video.
+    silent
+        It takes commands and answers none.
+
+    Attributes
+    ----------
+    mode, running
+        As the commands left them.
+    """
+
+    def __init__(self, *, locked: bool = True, silent: bool = False) -> None:
+        super().__init__()
+        self.mode = 0
+        self.running = False
+        self._locked = locked
+        self._silent = silent
+
+    def write(self, buff: bytes) -> int:
+        """Obey one command, `00 flags sequence length command data`."""
+        super().write(buff)
+        flags, sequence = buff[1], buff[2]
+        count = int.from_bytes(buff[3:5], "little")
+        command, data = int.from_bytes(buff[5:7], "little"), buff[7 : 5 + count]
+        failed, answer = self._obey(command, data, reading=bool(flags & 0x80))
+        if flags & 0x40 and not self._silent:
+            head = bytes([flags & 0x80 | (0x20 if failed else 0), sequence]) + len(answer).to_bytes(
+                2, "little"
+            )
+            self.send((head + answer).ljust(64, b"\x00"))
+        return len(buff)
+
+    def _obey(self, command: int, data: bytes, *, reading: bool) -> tuple[bool, bytes]:
+        if reading:
+            answers = {0x0205: bytes([3, 0, 1, 6]), 0x1A0A: b"\x01", 0x1A1B: bytes([self.mode])}
+            return command not in answers, answers.get(command, b"")
+        if command == 0x1A1B and data and data[0] <= 3:
+            if data[0] != 2 or self._locked:
+                self.mode = data[0]
+        elif command == 0x1A24 and data and data[0] <= 2 and not (data[0] and self.mode == 0):
+            self.running = data[0] == 2
+        else:
+            return True, b""
+        return False, b""
