@@ -211,6 +211,8 @@ def test_a_camera_that_stalls_times_out_and_one_that_is_unplugged_is_lost() -> N
         assert camera.grab().complete
         with pytest.raises(FrameTimeoutError):
             grab_until_it_fails(camera)
+        with pytest.raises(FrameTimeoutError):
+            camera.grab(0.05)
         emulator.unplug()
         with pytest.raises(DeviceLostError, match="no longer answers"):
             camera.grab(0.05)
@@ -258,8 +260,10 @@ def test_two_cameras_are_paired_and_the_one_that_is_lost_is_named() -> None:
         for _ in range(10):
             assert abs(pair.grab().apart_s) <= 1 / 120
         two.unplug()
-        with pytest.raises(DeviceLostError, match="camera 2"):
+        with pytest.raises(FrameTimeoutError, match="camera 2"):
             grab_until_it_fails(pair)
+        with pytest.raises(DeviceLostError, match="camera 2"):
+            pair.grab(0.05)
         pair.close()
         assert one.controlled is False
 

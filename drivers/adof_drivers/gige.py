@@ -89,6 +89,7 @@ class GigeCamera:
         self._stream: Any = None
         self._acquiring = False
         self._lost = False
+        self._silent = False
         found: list[Any] = []
         for timeout_ms in (300, 1500):
             found = viva.discover(timeout_ms, iface=self._interface)
@@ -226,20 +227,31 @@ class GigeCamera:
             raise self._failed(failure) from failure
 
     def grab(self, timeout_s: float = 1.0) -> Frame:
-        """Return the next frame not yet read; see `Camera.grab`."""
+        """Return the next frame not yet read; see `Camera.grab`.
+
+        Raises
+        ------
+        FrameTimeoutError
+            None in time.
+        DeviceLostError
+            None in time, again, and the camera does not answer: 0.4 s more.
+        """
         if self._stream is None:
             raise DriverError("the camera is not acquiring: start() it first")
         try:
             taken = self._stream.next_frame(max(round(timeout_s * 1000), 0))
         except self._error as failure:
             if "timeout" in str(failure):
-                if timeout_s > 0:
+                # The first silence is told at once, for whoever must stop; the next one asks the camera.
+                if timeout_s > 0 and self._silent:
                     self._require_there()
+                self._silent = self._silent or timeout_s > 0
                 raise FrameTimeoutError(
                     f"no frame from the camera at {self.address} within {timeout_s:.3g} s"
                 ) from None
             raise self._failed(failure) from failure
         received_s = time.monotonic()
+        self._silent = False
         if taken is None:
             raise DeviceLostError(f"the stream of the camera at {self.address} has ended: open it again")
         return self._frame(taken, received_s)
