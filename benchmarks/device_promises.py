@@ -3,8 +3,8 @@
 python benchmarks/device_promises.py [--rounds 5]
 
 Cameras are emulated GigE Vision cameras at 60 fps, in this process, taken through viva-genicam over loopback
-and asked with a time-out of three periods, as a control loop would. The window needs a display of 1920 x 1080:
-run it under xvfb-run. Prints the numbers of docs/device-promises.md.
+and asked with a time-out of three periods, as a control loop would. The window needs a display of
+1920 x 1080, such as xvfb-run gives. Prints the numbers of docs/device-promises.md.
 """
 
 from __future__ import annotations

@@ -118,6 +118,7 @@ def test_what_is_refused_changes_nothing(camera: GigeCamera) -> None:
 @needs_viva
 def test_a_software_trigger_gives_one_frame_each_and_none_without(camera: GigeCamera) -> None:
     camera.configure(trigger="software")
+    camera.trigger()  # before the start: for nothing
     camera.start()
     with pytest.raises(FrameTimeoutError):
         camera.grab(0.05)
@@ -258,7 +259,13 @@ def test_two_cameras_are_paired_and_the_one_that_is_lost_is_named() -> None:
         )
         pair.start()
         for _ in range(10):
-            assert abs(pair.grab().apart_s) <= 1 / 120
+            both = pair.grab()
+            assert abs(both.apart_s) <= 1 / 120
+            assert both.frame_1.device_time_s is not None
+            assert both.frame_2.device_time_s is not None
+            # Emulated cameras keep step; their stamps are whole nanoseconds.
+            periods = (both.frame_1.device_time_s - both.frame_2.device_time_s) * 60
+            assert periods == pytest.approx(round(periods), abs=1e-6)
         two.unplug()
         with pytest.raises(FrameTimeoutError, match="camera 2"):
             grab_until_it_fails(pair)

@@ -388,6 +388,8 @@ class GigeCameraEmulator:
                 self._set(_CLOCK_LOW, ticks & 0xFFFFFFFF)
             return 0
         if address == START:
+            while self._triggered.acquire(blocking=False):
+                pass  # what was triggered before is not exposed now
             with self._kept_lock:
                 self._kept.clear()
             self._acquiring.set()
@@ -447,29 +449,27 @@ class GigeCameraEmulator:
             self._stream.sendto(packet, (address, port))
 
     def _serve_frames(self) -> None:
-        due_s = 0.0
+        begun_s = time.monotonic()
         block = 0
         held: _Block | None = None
         frozen: NDArray[Any] | None = None
         while not self._closing.is_set():
             if not self._acquiring.is_set():
-                block, held, due_s = 0, None, 0.0
+                block, held, begun_s = 0, None, time.monotonic()
                 self._acquiring.wait(0.05)
                 continue
             if self._get(TRIGGER_MODE):
                 if not self._triggered.acquire(timeout=0.02):
                     continue
-                due_s = 0.0
-            elif due_s:
-                left_s = due_s - time.monotonic()
-                # An exposure that could not be made in its time is not made up for.
-                due_s = max(due_s, time.monotonic() - 1 / self._get_float(FRAME_RATE_HZ))
+                begun_s = time.monotonic()
+            else:
+                begun_s = self._next_moment_s(begun_s)
+                left_s = begun_s - time.monotonic()
                 if left_s > 0 and self._closing.wait(left_s):
                     return
                 if not self._acquiring.is_set():
                     continue
-            ticks = self._ticks()
-            due_s = (due_s or time.monotonic()) + 1 / self._get_float(FRAME_RATE_HZ)
+            ticks = round(begun_s * _TICKS_HZ)
             number, self._exposures = self._exposures, self._exposures + 1
             block = block % 0xFFFF + 1
             if _reached(self._faults.disconnect_at, number):
@@ -497,6 +497,14 @@ class GigeCameraEmulator:
                 if one is not None:
                     self._transmit(one, draw)
             held = None
+
+    def _next_moment_s(self, last_s: float) -> float:
+        """When to expose next: free-running cameras of one rate keep step, as if one clock triggered them.
+
+        A moment may begin late by up to a period; later ones are not made up for.
+        """
+        period_s = 1 / self._get_float(FRAME_RATE_HZ)
+        return period_s * max(round(last_s / period_s) + 1, math.floor(time.monotonic() / period_s))
 
     def _expose(self, number: int) -> NDArray[Any]:
         shape = (self._get(HEIGHT), self._get(WIDTH))
