@@ -59,7 +59,8 @@ def server(*command: str) -> Iterator[str]:
     """Run an X server on a display of its own choice and yield that display's name once it answers."""
     reading, writing = os.pipe()
     with subprocess.Popen(
-        [*command, "-displayfd", str(writing), "-nolisten", "tcp"],
+        # Without -noreset a server starts anew when its last window closes, and refuses whoever comes meanwhile.
+        [*command, "-displayfd", str(writing), "-nolisten", "tcp", "-noreset"],
         pass_fds=[writing],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -212,7 +213,7 @@ def test_the_chosen_monitor_shows_the_codes_and_the_other_is_left_alone(
     configuration = tmp_path / "xorg.conf"
     configuration.write_text(DUMMY, encoding="utf-8")
     log = tmp_path / "xorg.log"
-    with server("Xorg", "-config", str(configuration), "-logfile", str(log), "-noreset") as display:
+    with server("Xorg", "-config", str(configuration), "-logfile", str(log)) as display:
         monkeypatch.setenv("DISPLAY", display)
         for arguments in (
             ["--addmode", "DUMMY1", "640x480"],
