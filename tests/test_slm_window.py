@@ -59,7 +59,7 @@ def server(*command: str) -> Iterator[str]:
     """Run an X server on a display of its own choice and yield that display's name once it answers."""
     reading, writing = os.pipe()
     with subprocess.Popen(
-        # Without -noreset a server starts anew when its last window closes, and refuses whoever comes meanwhile.
+        # Otherwise a server starts anew when its last window closes, and refuses whoever comes meanwhile.
         [*command, "-displayfd", str(writing), "-nolisten", "tcp", "-noreset"],
         pass_fds=[writing],
         stdout=subprocess.DEVNULL,
