@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -45,6 +47,14 @@ def precision(request: pytest.FixtureRequest, device: Device) -> str:
     if request.param == "float64" and not device.facts.fp64:
         pytest.skip(f"{device.facts} has no float64")
     return str(request.param)
+
+
+@pytest.fixture
+def loopback_cameras() -> Iterator[None]:
+    """Let one test at a time have the cameras' address and port, whichever process it runs in."""
+    with (Path(tempfile.gettempdir()) / "adof-loopback-cameras.lock").open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -59,8 +59,11 @@ def application() -> typer.Typer:
         pass
 
     for name in COMMANDS:
-        command: Callable[..., None] = getattr(import_module(f"adof_cl.cli.{name}"), name)
-        app.command(name=name)(command)
+        command: Callable[..., None] | typer.Typer = getattr(import_module(f"adof_cl.cli.{name}"), name)
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=name)
+        else:
+            app.command(name=name)(command)
     return app
 
 

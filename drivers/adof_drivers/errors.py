@@ -51,3 +51,15 @@ class NotArmedError(DriverError):
 
 class FollowingError(DriverError):
     """An axis is not where its command should have brought it."""
+
+
+class FrameTimeoutError(DriverError):
+    """No usable frame came in time; the camera may still be there."""
+
+
+class DeviceLostError(DriverError):
+    """A device that was there no longer answers."""
+
+
+class FrozenFramesError(DriverError):
+    """A camera goes on counting but sends the same picture."""

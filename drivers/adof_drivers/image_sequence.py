@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +11,8 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from adof_drivers.camera import Frame
 from adof_drivers.errors import DriverError, EndOfSequenceError
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One picture. `pixels` is (rows, columns), uint8 or uint16; `time_s` counts from the first frame."""
-
-    pixels: NDArray[Any]
-    number: int
-    time_s: float
 
 
 def _read_stack(path: Path) -> Iterator[NDArray[Any]]:
@@ -48,7 +39,8 @@ class ImageSequenceCamera:
     source
         A TIFF stack, one picture, or a folder of pictures.
     rate_hz
-        Frame rate the times are counted with.
+        Frame rate the times are counted with; `time_s` of the first frame is 0. Nothing waits: a frame is
+        there when it is asked for.
 
     Raises
     ------
@@ -66,9 +58,8 @@ class ImageSequenceCamera:
             self._paths = [source] if source.is_file() else []
         if not self._paths:
             raise DriverError(f"{source} holds no PNG or TIFF: give a picture, a stack or a folder of them")
-        self._frames = self._read()
-        self._number = 0
-        self._shape: tuple[int, ...] | None = None
+        self._first: NDArray[Any] | None = None
+        self.start()
 
     def _read(self) -> Iterator[NDArray[Any]]:
         for path in self._paths:
@@ -77,7 +68,20 @@ class ImageSequenceCamera:
             else:
                 yield from _read_stack(path)
 
-    def grab(self) -> Frame:
+    def start(self) -> None:
+        """Begin with the first frame, again if some were served."""
+        self._frames = self._read()
+        self._number = 0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame; reads the first one if none was read."""
+        if self._first is None:
+            self._usable(next(self._read()))
+        assert self._first is not None
+        return self._first.shape[0], self._first.shape[1]
+
+    def grab(self, timeout_s: float = 1.0) -> Frame:  # noqa: ARG002  (as every camera)
         """Return the next frame.
 
         Raises
@@ -88,23 +92,34 @@ class ImageSequenceCamera:
             The next one cannot be used; the message says why.
         """
         try:
-            pixels = next(self._frames)
+            pixels = self._usable(next(self._frames))
         except StopIteration:
             raise EndOfSequenceError(
                 f"all {self._number} frames were served: open the sequence again"
             ) from None
+        time_s = self._number * self._period_s
+        frame = Frame(pixels, self._number, time_s, received_s=time_s, device_time_s=time_s)
+        self._number += 1
+        return frame
+
+    def _usable(self, pixels: NDArray[Any]) -> NDArray[Any]:
         if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
             raise DriverError(
                 f"frame {self._number} is {pixels.shape} {pixels.dtype}: "
                 "a grey picture of 8 or 16 bits was wanted"
             )
-        if self._shape is None:
-            self._shape = pixels.shape
-        if pixels.shape != self._shape:
+        if self._first is None:
+            self._first = pixels
+        if pixels.shape != self._first.shape:
             raise DriverError(
-                f"frame {self._number} is {pixels.shape}, the first was {self._shape}: "
+                f"frame {self._number} is {pixels.shape}, the first was {self._first.shape}: "
                 "keep one size to a sequence"
             )
-        frame = Frame(pixels, self._number, self._number * self._period_s)
-        self._number += 1
-        return frame
+        return pixels
+
+    def stop(self) -> None:
+        """Nothing runs that could be stopped."""
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._frames = iter(())

@@ -1,8 +1,10 @@
-"""Devices that speak the wire: a client gets the bytes that a controller would send.
+"""Devices that speak the real wire formats, so that drivers are proven without hardware.
 
-engine.py     what they share
+gige.py       a GigE Vision camera on UDP that serves the pictures it is given, with seeded faults
+hid.py        SpaceMouse, pedal, relay board and DLPC900, as hidapi hands them out
+engine.py     what emulated controllers share
 motion.py     motors with finite acceleration, on any clock
-faults.py     what goes wrong, and when: seeded
+faults.py     what goes wrong with a controller, and when: seeded
 gcs.py        a PI controller, GCS 2.0
 picomotor.py  a Picomotor 8742
 serve.py      an engine behind TCP or a pseudo terminal

@@ -1,0 +1,314 @@
+"""GigE Vision cameras, through viva-genicam (extra `gige`)."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import time
+from typing import Any
+
+import numpy as np
+
+from adof_drivers.camera import CameraSettings, DeviceClock, Frame, Trigger, require_settings
+from adof_drivers.errors import DeviceLostError, DriverError, FrameTimeoutError
+
+_GREY = {"Mono8": "u1", "Mono10": "<u2", "Mono12": "<u2", "Mono14": "<u2", "Mono16": "<u2"}
+_ASKED = 0.2  # seconds a camera on the same wire gets to answer; they answer within a few ms
+_TRIES = 2
+
+
+def answers(address: str, port: int = 3956) -> bool:
+    """Whether a GigE Vision device at `address` reads out a register for us, within 0.4 s.
+
+    Anybody may ask, whoever holds control; it tells a camera that sends no frames from one that is gone.
+    """
+    request = struct.pack(">BBHHHI", 0x42, 1, 0x80, 4, 1, 0xA00)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        asking.settimeout(_ASKED)
+        for _ in range(_TRIES):
+            try:
+                asking.sendto(request, (address, port))
+                if asking.recvfrom(64)[0][2:4] == b"\x00\x81":
+                    return True
+            except OSError:  # no answer in time, or nobody listens there
+                continue
+    return False
+
+
+class BlockNumbers:
+    """Count on where a camera's 16-bit block numbers go from 65535 to 1; 0 is never used."""
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+        self._last_block = 0
+
+    def number(self, block: int) -> int:
+        """Return the frame's number, on from the first block seen; below the last one if out of order."""
+        if self._last is None:
+            self._last, self._last_block = block, block
+            return block
+        step = block - self._last_block
+        if max(block, self._last_block) <= 0xFFFF:
+            step = (step + 0x7FFF) % 0xFFFF - 0x7FFF
+        number = self._last + step
+        if step > 0:
+            self._last, self._last_block = number, block
+        return number
+
+
+class GigeCamera:
+    """A grey GigE Vision camera.
+
+    Parameters
+    ----------
+    address
+        Its IPv4 address.
+    interface
+        Name or address of the network interface it is on; default: the loopback interface for 127.x.x.x,
+        else every interface is searched. Finding a camera broadcasts on the interface.
+    packet_size
+        Bytes of a network packet; default: the largest that gets through, as tried out.
+
+    Raises
+    ------
+    DriverError
+        viva-genicam is absent, no camera answers at `address`, another program holds it, or it is set to a
+        pixel format that is not plain grey.
+    """
+
+    def __init__(self, address: str, *, interface: str | None = None, packet_size: int | None = None) -> None:
+        try:
+            import viva_genicam as viva
+        except ImportError as failure:
+            raise DriverError("GigE Vision needs viva-genicam: pip install 'adof-cl[gige]'") from failure
+        self.address = address
+        self._interface = interface or ("lo" if address.startswith("127.") else None)
+        self._packet_size = packet_size
+        self._error = viva.GenicamError
+        self._roi = viva.Roi
+        self._stream: Any = None
+        self._acquiring = False
+        self._lost = False
+        self._silent = False
+        found: list[Any] = []
+        for timeout_ms in (300, 1500):
+            found = viva.discover(timeout_ms, iface=self._interface)
+            here = [one for one in found if one.ip == address]
+            if here:
+                break
+        else:
+            others = ", ".join(one.ip for one in found) or "none"
+            raise DriverError(
+                f"no GigE Vision camera answers at {address} (others found: {others}): check its power, "
+                "cable and address, and that the firewall lets UDP port 3956 through"
+            )
+        try:
+            self._camera = viva.connect_gige(here[0], iface=self._interface)
+        except viva.GenicamError as failure:
+            busy = "ACCESS_DENIED" in str(failure)
+            raise DriverError(
+                f"the camera at {address} cannot be opened ({failure}): "
+                + ("another program holds it, close that one" if busy else "switch it off and on")
+            ) from failure
+        try:
+            self.model = f"{here[0].manufacturer} {here[0].model}"
+            self._tick_s = self._read_tick_s()
+            self._format = self._camera.get_enum("PixelFormat")
+            if self._format not in _GREY:
+                raise DriverError(
+                    f"the camera at {address} sends {self._format}: set it to one of {', '.join(_GREY)}"
+                )
+            self._sensor = (self._camera.get_integer("SensorHeight"), self._camera.get_integer("SensorWidth"))
+            self.settings = self._read_settings("free")
+            self._camera.disable_trigger("FrameStart")
+        except viva.GenicamError as failure:
+            self.close()
+            raise DriverError(f"the camera at {address} lacks what was asked of it: {failure}") from failure
+        except DriverError:
+            self.close()
+            raise
+
+    def _read_tick_s(self) -> float:
+        for name in ("GevTimestampTickFrequency", "TimestampTickFrequency"):
+            try:
+                return 1 / float(self._camera.get_integer(name))
+            except (self._error, ZeroDivisionError):
+                continue
+        return 1e-9  # GigE Vision 2.1: cameras without that register count nanoseconds
+
+    def _read_settings(self, trigger: Trigger) -> CameraSettings:
+        roi = self._camera.roi()
+        numbers: list[float | None] = []
+        for read in (self._camera.exposure_time, self._camera.frame_rate):
+            try:
+                numbers.append(float(read()))
+            except self._error:
+                numbers.append(None)
+        exposure_us, rate_hz = numbers
+        exposure_s = None if exposure_us is None else exposure_us * 1e-6
+        return CameraSettings((roi.y, roi.x), (roi.height, roi.width), exposure_s, rate_hz, trigger)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+        return self.settings.shape
+
+    @property
+    def sensor(self) -> tuple[int, int]:
+        """Rows and columns of the whole sensor."""
+        return self._sensor
+
+    def configure(
+        self,
+        *,
+        region: tuple[tuple[int, int], tuple[int, int]] | None = None,
+        exposure_s: float | None = None,
+        rate_hz: float | None = None,
+        trigger: Trigger | None = None,
+    ) -> CameraSettings:
+        """Change what is given, before `start()`; return what the camera made of it.
+
+        Parameters
+        ----------
+        region
+            ((row, column) of the first pixel, (rows, columns)).
+
+        Raises
+        ------
+        DriverError
+            The camera is acquiring, or refuses; what was refused here is not sent.
+        """
+        if self._stream is not None:
+            raise DriverError("the camera is acquiring: stop() it before configure()")
+        require_settings(self._sensor, region, exposure_s, rate_hz, trigger)
+        try:
+            if region is not None:
+                (y, x), (rows, columns) = region
+                self._camera.set_roi(self._roi(x=x, y=y, width=columns, height=rows))
+            if exposure_s is not None:
+                self._camera.set_exposure_time(exposure_s * 1e6)
+            if rate_hz is not None:
+                self._camera.set_frame_rate(rate_hz)
+            if trigger == "software":
+                self._camera.enable_trigger("FrameStart", "Software")
+            elif trigger == "free":
+                self._camera.disable_trigger("FrameStart")
+        except self._error as failure:
+            raise DriverError(f"the camera at {self.address} refuses: {failure}") from failure
+        finally:
+            self.settings = self._read_settings(trigger or self.settings.trigger)
+        return self.settings
+
+    def start(self) -> None:
+        """Begin to acquire; frames count from 1, or where the camera begins."""
+        if self._stream is not None:
+            return
+        self._clock, self._numbers = DeviceClock(), BlockNumbers()
+        try:
+            self._stream = self._camera.stream(
+                iface=self._interface,
+                packet_size=self._packet_size,
+                auto_packet_size=self._packet_size is None,
+                deliver_incomplete=True,
+            )
+            self._stream.__enter__()
+        except self._error as failure:
+            self.stop()
+            raise self._failed(failure) from failure
+        self._acquiring = True
+
+    def trigger(self) -> None:
+        """Expose once; only with `trigger="software"`."""
+        if self.settings.trigger != "software":
+            raise DriverError("the camera runs freely: configure(trigger='software') first")
+        try:
+            self._camera.trigger_software()
+        except self._error as failure:
+            raise self._failed(failure) from failure
+
+    def grab(self, timeout_s: float = 1.0) -> Frame:
+        """Return the next frame not yet read; see `Camera.grab`.
+
+        Raises
+        ------
+        FrameTimeoutError
+            None in time.
+        DeviceLostError
+            None in time, again, and the camera does not answer: 0.4 s more.
+        """
+        if self._stream is None:
+            raise DriverError("the camera is not acquiring: start() it first")
+        try:
+            taken = self._stream.next_frame(max(round(timeout_s * 1000), 0))
+        except self._error as failure:
+            if "timeout" in str(failure):
+                # The first silence is told at once, for whoever must stop; the next one asks the camera.
+                if timeout_s > 0 and self._silent:
+                    self._require_there()
+                self._silent = self._silent or timeout_s > 0
+                raise FrameTimeoutError(
+                    f"no frame from the camera at {self.address} within {timeout_s:.3g} s"
+                ) from None
+            raise self._failed(failure) from failure
+        received_s = time.monotonic()
+        self._silent = False
+        if taken is None:
+            raise DeviceLostError(f"the stream of the camera at {self.address} has ended: open it again")
+        return self._frame(taken, received_s)
+
+    def _frame(self, taken: Any, received_s: float) -> Frame:
+        if taken.pixel_format != self._format:
+            raise DriverError(f"a frame of {taken.pixel_format} came, the camera was set to {self._format}")
+        dtype = np.dtype(_GREY[self._format])
+        stride = taken.width * dtype.itemsize + taken.padding_x
+        payload = taken.payload()
+        if len(payload) < stride * taken.height - taken.padding_x:
+            raise DriverError(
+                f"a frame of {len(payload)} bytes came: {taken.height} lines of {stride} bytes were announced"
+            )
+        pixels: np.ndarray[Any, Any] = np.ndarray(
+            (taken.height, taken.width), dtype, buffer=payload, strides=(stride, dtype.itemsize)
+        )
+        device_s = None if taken.ts_dev is None else taken.ts_dev * self._tick_s
+        return Frame(
+            pixels=pixels,
+            number=self._numbers.number(taken.block_id),
+            time_s=received_s if device_s is None else self._clock.host_s(device_s, received_s),
+            received_s=received_s,
+            device_time_s=device_s,
+            complete=taken.is_complete,
+            origin_yx=self.settings.origin_yx,
+        )
+
+    def _require_there(self) -> None:
+        if not answers(self.address):
+            self._lost = True
+            raise DeviceLostError(
+                f"the camera at {self.address} no longer answers: check cable and power, then open it again"
+            )
+
+    def _failed(self, failure: Exception) -> DriverError:
+        try:
+            self._require_there()
+        except DeviceLostError as lost:
+            return lost
+        return DriverError(f"the camera at {self.address} failed: {failure}")
+
+    def stop(self) -> None:
+        """Acquire no more; a camera that is gone is not waited for."""
+        stream, self._stream = self._stream, None
+        if stream is None:
+            return
+        # To stop a camera that does not answer would take viva-genicam nine seconds of asking.
+        if self._acquiring and not self._lost and answers(self.address):
+            try:
+                stream.__exit__(None, None, None)
+            except self._error:
+                self._lost = True
+        self._acquiring = False
+        stream.close()
+
+    def close(self) -> None:
+        """Give the camera back to others; may be called twice, never raises."""
+        self.stop()
+        self._camera.close()
