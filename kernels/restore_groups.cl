@@ -169,7 +169,7 @@ typedef real stored;
             for (int q = 0; q < R; ++q) {                                                                   \
                 const real gr = long_axis[2 * (i * R + q)], gi = long_axis[2 * (i * R + q) + 1];            \
                 const real power = (gr * gr + gi * gi) * (h.x * h.x + h.y * h.y) + noise;                   \
-                const real share = power > 0 ? scale / power : 0;                                           \
+                const real share = power > REAL_LEAST ? scale / power : 0;                                  \
                 const real tr = xr[q] * gr + xi[q] * gi, ti = xi[q] * gr - xr[q] * gi;                      \
                 xr[q] = (tr * h.x + ti * h.y) * share;                                                      \
                 xi[q] = (ti * h.x - tr * h.y) * share;                                                      \
