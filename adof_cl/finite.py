@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adof_cl.errors import InputError
+
+TRANSFER_LIMIT = 1e3
+"""Largest modulus of a transfer function: lifted by kernels/wiener.cl, its fourth power fits float32."""
 
 
 def finite_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
@@ -41,3 +46,19 @@ def finite_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> 
         raise InputError(f"{name} holds {bad} numbers that are NaN or infinite: leave those out")
     checked.flags.writeable = False
     return checked
+
+
+def require_transfer(name: str, values: NDArray[Any]) -> None:
+    """Refuse what is too large for a transfer function, whose square a kernel must hold.
+
+    Raises
+    ------
+    InputError
+        A modulus above `TRANSFER_LIMIT`.
+    """
+    largest = float(np.abs(values).max())
+    if largest > TRANSFER_LIMIT:
+        raise InputError(
+            f"{name} reaches {largest:g}: a transfer function is 1 at frequency 0 and at most "
+            f"{TRANSFER_LIMIT:g} was wanted, so divide it by its value there"
+        )

@@ -12,6 +12,9 @@ from adof_cl.errors import InputError
 from adof_cl.finite import finite_array
 from adof_cl.padding import padded_frame
 
+NSR_LIMIT = 1e12
+"""Above it a filter restores nothing, and a float32 kernel could no longer form it."""
+
 _CLASSES = 60
 _MEMBERS = 8
 _DECADES = 14
@@ -24,12 +27,15 @@ def checked_nsr(nsr: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
     Raises
     ------
     InputError
-        Another shape, not finite, or below 0.
+        Another shape, not finite, below 0, or above `NSR_LIMIT`.
     """
     values = finite_array("nsr", nsr, () if np.ndim(nsr) == 0 else shape)
     lowest = float(values.min())
     if lowest < 0:
         raise InputError(f"nsr is {lowest:g}: a noise-to-signal power of 0 or more was wanted")
+    highest = float(values.max())
+    if highest > NSR_LIMIT:
+        raise InputError(f"nsr is {highest:g}: at most {NSR_LIMIT:g} was wanted, where nothing is restored")
     return values
 
 
@@ -78,6 +84,8 @@ def noise_to_signal(
     image = np.asarray(frame, dtype=np.float64)
     if not np.isfinite(image).all():
         raise InputError("the frame holds NaN or infinity: replace those pixels first")
+    # The result has no unit; without this the power of a frame in a large one would overflow.
+    image = image / max(float(np.abs(image).max()), 1e-300)
     spectrum = scipy.fft.rfft2(padded_frame(image - image.mean(), padded, taper=taper))
     power = np.abs(spectrum) ** 2 / (ny * nx)
     f_squared = np.fft.fftfreq(ny)[:, None] ** 2 + np.fft.rfftfreq(nx)[None, :] ** 2

@@ -19,13 +19,18 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from adof_cl.device import Device, DeviceArray
-from adof_cl.errors import InputError
+from adof_cl.errors import InputError, LimitError
 from adof_cl.fft_passes import Passes, pass_lists
-from adof_cl.noise import checked_nsr
+from adof_cl.finite import require_transfer
+from adof_cl.noise import NSR_LIMIT, checked_nsr
 from adof_cl.padding import checked_frame_shape, padded_shape, padding_weights
 from adof_cl.program import Argument, Launch, Program, vector_bytes
 
 FAMILIES = ("lanes", "groups")
+GAIN_LIMIT = 1e15
+"""Largest gain of a filter: what no 16-bit frame of 16384 x 16384 can carry beyond float32."""
+
+_HALF_LARGEST = 65504.0
 
 _C_TYPES = {"uint8": "uchar", "uint16": "ushort", "float32": "float", "float64": "double"}
 
@@ -210,6 +215,8 @@ class Restore:
     ----------
     padded_shape
         (ny, nx): the lengths of the OTF axes; filters are (ny, nx // 2 + 1).
+    half_gain_limit
+        Largest `line_gain` of a filter where the spectrum is kept in float16: beyond, a frame could overflow.
 
     Raises
     ------
@@ -369,6 +376,10 @@ class Restore:
             },
         )
         # What the transforms leave undone: 1/2 of two that share one, and 1/n of each axis.
+        # A line of n stored numbers, each at most a pixel's 256 levels, leaves a filter with at most root n
+        # times its rms gain in one of them.
+        self._half_rows = cut.half_rows
+        self.half_gain_limit = _HALF_LARGEST / (256 * math.sqrt(inner.length))
         self._scale = (1.0 if self.spectrum_dtype == np.float16 else 0.5 / outer.length) / inner.length
         self._lift = 2.0 ** (300 if self._real == np.float64 else 40)  # both factors of H are lifted, so H is
         self._lifted_scale = self._real.type(self._lift * self._scale)
@@ -413,6 +424,8 @@ class Restore:
         axes = [_checked_axis("h_rows", h_rows, ny), _checked_axis("h_cols", h_cols, nx)]
         noise = checked_nsr(nsr, (ny, nx // 2 + 1))
         slot = _checked_slot(slot)
+        if self.spectrum_dtype == np.float16:
+            self._require_half_gain(self.line_gain(_wiener_modulus(axes[0], axes[1], noise)))
         level: float | DeviceArray
         if noise.ndim == 0:
             level = float(noise)
@@ -423,7 +436,8 @@ class Restore:
         kept = self._filters.setdefault(slot, _Filter())
         if kept.own_axes is None:
             kept.own_axes = self.device.empty((ny + nx,), self._complex)
-        self.set_filter_table(kept.own_axes.upload(np.concatenate(axes).astype(self._complex)), level, slot)
+        own = kept.own_axes.upload(np.concatenate(axes).astype(self._complex))
+        self._set_table(own, level, slot, 0)
 
     def set_filter_table(
         self, table: DeviceArray, nsr: float | DeviceArray, slot: int = 0, *, entry: int = 0
@@ -448,9 +462,18 @@ class Restore:
         ------
         InputError
             Another shape or type, no such entry, or a negative nsr; the slot keeps what it had.
+        LimitError
+            The spectrum is kept in half numbers and the filter's gain, which without noise has no bound,
+            could leave them.
         """
-        ny, nx = self.padded_shape
         slot = _checked_slot(slot)
+        if self.spectrum_dtype == np.float16:
+            level = 0.0 if isinstance(nsr, DeviceArray) else float(nsr)
+            self._require_half_gain(0.5 / math.sqrt(level) if level > 0 else math.inf)
+        self._set_table(table, nsr, slot, entry)
+
+    def _set_table(self, table: DeviceArray, nsr: float | DeviceArray, slot: int, entry: int) -> None:
+        ny, nx = self.padded_shape
         if table.dtype != self._complex or table.shape[-1] != ny + nx or len(table.shape) > 2:
             raise InputError(
                 f"the table is {table.shape} {table.dtype}, ({ny + nx},) or (k, {ny + nx}) {self._complex} "
@@ -471,7 +494,7 @@ class Restore:
             self._form()
             return
         level = float(nsr)
-        if not 0 <= level < math.inf:
+        if not 0 <= level <= NSR_LIMIT:
             checked_nsr(level, (ny, nx // 2 + 1))  # says what is wrong
         kept = self._filters.setdefault(slot, _Filter())
         kept.formed, kept.axes, kept.entry = True, table, first
@@ -489,7 +512,9 @@ class Restore:
         Raises
         ------
         InputError
-            Wrong shape or type, or not finite; the slot keeps what it had.
+            Wrong shape or type, not finite, or above `GAIN_LIMIT`; the slot keeps what it had.
+        LimitError
+            The spectrum is kept in half numbers, and the gain could leave them or lies on the device.
         """
         ny, nx = self.padded_shape
         wanted = (ny, nx // 2 + 1)
@@ -500,6 +525,8 @@ class Restore:
                     f"the filter is {gain.shape} {gain.dtype}, {wanted} {self._complex} was wanted: form it "
                     "for the padded half spectrum"
                 )
+            if self.spectrum_dtype == np.float16:
+                self._require_half_gain(math.inf)
             source = gain
         else:
             values = np.asarray(gain)
@@ -510,12 +537,33 @@ class Restore:
                 )
             if not np.isfinite(values).all():
                 raise InputError("the filter holds NaN or infinity: only finite gains can be applied")
+            largest = float(np.abs(values).max())
+            if largest > GAIN_LIMIT:
+                raise InputError(f"the filter's gain reaches {largest:g}: at most {GAIN_LIMIT:g} was wanted")
+            if self.spectrum_dtype == np.float16:
+                self._require_half_gain(self.line_gain(values))
             if self._gain is None:
                 self._gain = self.device.empty(wanted, self._complex)
             source = self._gain.upload(values.astype(self._complex))
         self._arrange.set(0, source)
         self._arrange.set(3, self._stored_filter(slot))
         self._arrange()
+
+    def line_gain(self, gain: NDArray[Any]) -> float:
+        """Return the largest root mean square of a filter, (ny, nx // 2 + 1), along the inner axis.
+
+        Lines of the outer axis' other frequencies than 0 count half: the mean of a line of pixels from 0 to p
+        times a turning unit is at most p/2. A filter's largest gain bounds the result from above.
+        """
+        power = np.abs(gain).astype(np.float64) ** 2
+        if self._half_rows:
+            nx = self.padded_shape[1]
+            counted = np.where((np.arange(nx // 2 + 1) % nx == 0) | (2 * np.arange(nx // 2 + 1) == nx), 1, 2)
+            lines = power @ counted / nx
+        else:
+            lines = power.mean(axis=0)
+        lines[1:] /= 4
+        return math.sqrt(float(lines.max()))
 
     # ---- frames -------------------------------------------------------------------------------------------
 
@@ -579,6 +627,8 @@ class Restore:
         ------
         InputError
             Another shape or type than the plan's, NaN or infinity, or an empty slot.
+        LimitError
+            The image does not fit its type: frame and gain are together too large.
         """
         if frame.shape != self.shape or frame.dtype != self.in_dtype:
             raise InputError(
@@ -590,7 +640,9 @@ class Restore:
         if self._frame is None or self._image is None:
             self._frame = self.device.empty(self.shape, self.in_dtype)
             self._image = self.device.empty(self.shape, self.out_dtype)
-        return self(self._frame.upload(frame), self._image, slot).download()
+        image = self(self._frame.upload(frame), self._image, slot).download()
+        require_finite_image(image)
+        return image
 
     # ---- inside -------------------------------------------------------------------------------------------
 
@@ -607,6 +659,14 @@ class Restore:
             )
         else:
             self._steps.set(filter=kept.stored)
+
+    def _require_half_gain(self, largest: float) -> None:
+        if largest > self.half_gain_limit:
+            said = f"may reach {largest:.3g}" if math.isfinite(largest) else "is not bounded on the host"
+            raise LimitError(
+                f"the filter's gain {said}: a spectrum in half numbers holds {self.half_gain_limit:.3g} at "
+                f"this size, so use an nsr of {0.25 / self.half_gain_limit**2:.2g} or more, or float32"
+            )
 
     def _require_array(self, name: str, array: DeviceArray, dtype: np.dtype[Any]) -> None:
         if array.shape != self.shape or array.dtype != dtype:
@@ -662,10 +722,41 @@ def _checked_axis(name: str, values: ArrayLike, length: int) -> NDArray[Any]:
         )
     if not np.isfinite(axis).all():
         raise InputError(f"{name} holds NaN or infinity: a finite OTF was wanted")
+    require_transfer(name, axis)
     if length % 2 == 0:  # the half spectrum of a real image has no room for a sign there
         axis = axis.copy()
         axis[length // 2] = axis[length // 2].real
     return axis
+
+
+def _wiener_modulus(
+    h_rows: NDArray[Any], h_cols: NDArray[Any], nsr: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return |H| / (|H|^2 + nsr), (ny, nx // 2 + 1); Nyquist bins are real, as in the kernel."""
+    held = []
+    for axis in (h_rows, h_cols):
+        values = np.array(axis, dtype=np.complex128)
+        if values.size % 2 == 0:
+            values[values.size // 2] = values[values.size // 2].real
+        held.append(np.abs(values))
+    modulus = np.outer(held[0], held[1][: h_cols.size // 2 + 1])
+    power = modulus**2 + nsr
+    return np.asarray(np.divide(modulus, power, out=np.zeros_like(modulus), where=power > 0))
+
+
+def require_finite_image(image: NDArray[Any]) -> None:
+    """Refuse an image that left its type's range on the way.
+
+    Raises
+    ------
+    LimitError
+        NaN or infinity in it.
+    """
+    if image.dtype.kind == "f" and not np.isfinite(image).all():
+        raise LimitError(
+            f"the restored image does not fit {image.dtype}: frame and gain are together too large, so scale "
+            "the frame down or give more noise"
+        )
 
 
 def _checked_slot(slot: int) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adof_cl.errors import AdofError, InputError, StreamError
-from adof_cl.restore import Restore
+from adof_cl.restore import Restore, require_finite_image
 
 Item = TypeVar("Item")
 Value = TypeVar("Value")
@@ -415,5 +415,13 @@ class RestoredFrames:
         return self._images[buffer].arrived
 
     def collect(self, buffer: int) -> NDArray[Any]:
-        """Wait for the image and return it, (rows, columns) of the plan's `out_dtype`, the caller's own."""
-        return self._images[buffer].download()
+        """Wait for the image and return it, (rows, columns) of the plan's `out_dtype`, the caller's own.
+
+        Raises
+        ------
+        LimitError
+            The image does not fit its type.
+        """
+        image = self._images[buffer].download()
+        require_finite_image(image)
+        return image

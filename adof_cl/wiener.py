@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError
+from adof_cl.finite import TRANSFER_LIMIT, require_transfer
 from adof_cl.noise import checked_nsr
 from adof_cl.program import Program
 
@@ -91,6 +94,7 @@ class WienerFilter:
                 raise InputError(
                     f"{name} is {axis.shape} {axis.dtype}: ({length},) finite numbers were wanted"
                 )
+            require_transfer(name, axis)
             axes.append(axis.astype(self._complex))
         level, noise = self._checked_noise(nsr)
         out = self._checked_out(out)
@@ -115,6 +119,7 @@ class WienerFilter:
             raise InputError(
                 f"otf is {spectrum.shape} {spectrum.dtype}: {self.filter_shape} finite numbers were wanted"
             )
+        require_transfer("otf", spectrum)
         level, noise = self._checked_noise(nsr)
         out = self._checked_out(out)
         self._otf.upload(spectrum.astype(self._complex))
@@ -180,7 +185,8 @@ def psf_otf(
     Raises
     ------
     InputError
-        Not two-dimensional, larger than the frame, not finite, or a sum of 0 or less.
+        Not two-dimensional, larger than the frame, not finite, or a sum that is not above a thousandth of the
+        sum of moduli: negative values must not cancel what they are divided by.
 
     Source
     ------
@@ -197,9 +203,16 @@ def psf_otf(
     if not np.isfinite(values).all():
         raise InputError("the PSF holds NaN or infinity: finite numbers were wanted")
     grid = values.astype(np.float64)
-    total = float(grid.sum())
+    largest = float(np.abs(grid).max())
+    grid = np.ldexp(grid, -math.frexp(largest)[1])  # any unit: no sum overflows
+    total, moduli = float(grid.sum()), float(np.abs(grid).sum())
     if total <= 0:
-        raise InputError(f"the PSF sums to {total:g}: a sum above 0 was wanted")
+        raise InputError(f"the PSF sums to {float(values.sum(dtype=np.float64)):g}: a sum above 0 was wanted")
+    if total * TRANSFER_LIMIT < moduli:
+        raise InputError(
+            f"the PSF's negative values leave {total / moduli:.1g} of its sum: at least "
+            f"{1 / TRANSFER_LIMIT:g} was wanted, so subtract the dark frame anew"
+        )
     centre = centre_yx or (values.shape[0] // 2, values.shape[1] // 2)
     if any(not 0 <= c < side for c, side in zip(centre, values.shape, strict=True)):
         raise InputError(f"the PSF's centre is {centre}: a pixel of its {values.shape} was wanted")

@@ -15,11 +15,13 @@ typedef double  real;
 typedef double2 real2;
 #define REAL_C(x)   (x)
 #define REAL_EPS    2.220446049250313e-16
+#define REAL_LEAST  1e-200
 #else
 typedef float  real;
 typedef float2 real2;
 #define REAL_C(x)   (x##f)
 #define REAL_EPS    1.1920929e-7f
+#define REAL_LEAST  1e-26f   // least divisor of a filter: 2^40 over it (2^300 in double) is still finite
 #endif
 
 typedef real2 cplx;   // .x real part, .y imaginary part

@@ -172,7 +172,7 @@ typedef real stored;
                 const real gr = WIENER_LIFT * otf[2 * bin[i * R + q]];                                      \
                 const real gi = WIENER_LIFT * otf[2 * bin[i * R + q] + 1];                                  \
                 const real power = (gr * gr + gi * gi) * (h.x * h.x + h.y * h.y) + noise;                   \
-                const real share = power > 0 ? scale / power : 0;                                           \
+                const real share = power > REAL_LEAST ? scale / power : 0;                                  \
                 const real tr = xr[q] * gr + xi[q] * gi, ti = xi[q] * gr - xr[q] * gi;                      \
                 xr[q] = (tr * h.x + ti * h.y) * share;                                                      \
                 xi[q] = (ti * h.x - tr * h.y) * share;                                                      \

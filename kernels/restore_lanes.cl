@@ -281,7 +281,7 @@ ALWAYS_INLINE void restore_scatter(const vec *work, __global OUT_TYPE *image, co
             for (int q = 0; q < R; ++q) {                                                                   \
                 const real gr = along[2 * (b + q)], gi = along[2 * (b + q) + 1];                            \
                 const vec power = (gr * gr + gi * gi) * short_power + noise;                                \
-                const vec share = power > (vec)(0) ? scale / power : (vec)(0);                              \
+                const vec share = power > (vec)(REAL_LEAST) ? scale / power : (vec)(0);                     \
                 const vec tr = xr[q] * gr + xi[q] * gi, ti = xi[q] * gr - xr[q] * gi;                       \
                 xr[q] = (tr * hr + ti * hi) * share;                                                        \
                 xi[q] = (ti * hr - tr * hi) * share;                                                        \

@@ -1,6 +1,7 @@
 // wiener.cl : the filter that undoes a known blur as far as noise allows.
 //
 //   G = conj(H) / (|H|^2 + nsr), and 0 where H = 0       docs/maths.md, eqs. W1 and W9
+//   H = 0 where |H|^2 + nsr < 8e-51 (2e-381 in double): G would end beyond the largest number.
 //
 //   h_rows    (.., NY) cplx           1-D OTF along y, DC first; of a table: `rows_from` on
 //   h_cols    (.., NX) cplx           1-D OTF along x, DC first; of a table: `cols_from` on
@@ -34,7 +35,7 @@ static inline cplx wiener_gain(const cplx h, const real nsr, const real scale)
 {
     const real lift = WIENER_LIFT * WIENER_LIFT;
     const real power = cplx_abs2(h) + lift * (lift * nsr);
-    const real share = power > 0 ? scale * lift / power : 0;
+    const real share = power > REAL_LEAST ? scale * lift / power : 0;
     return share * cplx_conj(h);
 }
 

@@ -28,6 +28,7 @@ COMMANDS: tuple[str, ...] = (
     "rig",
     "emulate",
     "selftest",
+    "envelope",
     "bench",
 )
 """Modules of this package, in the order `adof --help` lists them."""
