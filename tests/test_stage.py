@@ -256,11 +256,11 @@ def test_a_stop_still_goes_out_when_the_link_is_out_of_step() -> None:
     with gcs_rig(Fault("lose", at=0), timeout_s=0.05) as rig:
         with pytest.raises(ReplyTimeoutError):
             rig.stage.position()
-        rig.engine.received.clear()
         rig.stage.stop()
-        while not rig.engine.received:
+        while len(rig.engine.received) < 3:
             threading.Event().wait(0.001)
-        assert rig.engine.received == [b"\x18"]
+        # The stop of the failure, and the one asked for.
+        assert rig.engine.received == [b"POS? 1 2", b"\x18", b"\x18"]
 
 
 @pytest.mark.parametrize(
