@@ -1,4 +1,4 @@
-"""What a stage does when something fails, and how soon: `python benchmarks/stage_promises.py`, in Markdown.
+"""What a stage does when something fails, and how soon; prints a Markdown table.
 
 The controller is emulated behind a TCP port of this machine, 4 mm/s, 50 mm/s^2, time-out 0.1 s; every row is
 the worst of ten. "Told after" counts from the call that meets the fault to its exception, "at rest after"

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adof_drivers.emulators.gcs import GcsEngine
-from adof_drivers.errors import DialectError, DriverError, LinkError
+from adof_drivers.errors import DialectError, DriverError, LinkError, StoppedError
 from adof_drivers.gcs import GcsController
 from adof_drivers.link import Link
 from stage_rigs import ManualClock
@@ -24,13 +24,13 @@ class MemoryTransport:
     name = "memory"
 
     def __init__(self, engine: GcsEngine) -> None:
-        self._engine = engine
+        self.engine = engine
         self._replies = b""
         self.instead: bytes | None = None
         self.closed = False
 
     def write(self, data: bytes) -> None:
-        replies = b"".join(reply.data for reply in self._engine.feed(data))
+        replies = b"".join(reply.data for reply in self.engine.feed(data))
         self._replies += replies if self.instead is None else self.instead
         self.instead = None
 
@@ -140,3 +140,22 @@ def test_a_referenced_axis_that_says_it_is_beyond_its_travel_is_not_believed() -
     transport.instead = b"1=12.5 \n2=99.5\n"
     with pytest.raises(DriverError, match="lost count"):
         controller.positions(("1", "2"))
+
+
+def test_a_stop_that_comes_while_a_move_is_sent_has_the_last_word() -> None:
+    controller, transport = opened()
+    controller.enable(("1", "2"), since=0)
+    controller.home(("1", "2"), since=0)
+    send = transport.write
+
+    def stopped_just_before(data: bytes) -> None:
+        transport.write = send  # type: ignore[method-assign]
+        controller.stop()
+        send(data)
+
+    transport.write = stopped_just_before  # type: ignore[method-assign]
+    with pytest.raises(StoppedError):
+        controller.move({"1": 20.0}, {"1": 4.0}, (), since=0)
+    sent = [line[:3] for line in transport.engine.received[-5:]]
+    assert sent == [b"\x18", b"VEL", b"MOV", b"ERR", b"\x18"]
+    assert transport.engine.motors["1"].target != 20.0

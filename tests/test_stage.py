@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adof_drivers.emulators.faults import Fault
+from adof_drivers.emulators.faults import Fault, FaultSchedule
 from adof_drivers.emulators.gcs import GcsEngine
 from adof_drivers.emulators.serve import Served
 from adof_drivers.errors import (
@@ -256,11 +256,11 @@ def test_a_stop_still_goes_out_when_the_link_is_out_of_step() -> None:
     with gcs_rig(Fault("lose", at=0), timeout_s=0.05) as rig:
         with pytest.raises(ReplyTimeoutError):
             rig.stage.position()
-        rig.engine.received.clear()
         rig.stage.stop()
-        while not rig.engine.received:
+        while len(rig.engine.received) < 3:
             threading.Event().wait(0.001)
-        assert rig.engine.received == [b"\x18"]
+        # The stop of the failure, and the one asked for.
+        assert rig.engine.received == [b"POS? 1 2", b"\x18", b"\x18"]
 
 
 @pytest.mark.parametrize(
@@ -381,3 +381,35 @@ while True:
         # 1 mm/s for a quarter of a second at most; 1 mm/s is braked on 10 um, before the target.
         assert 0 < engine.position["1"] - killed_at <= 0.25
         assert not [line for line in engine.received if line == b"\x18"]
+
+
+@pytest.mark.parametrize("kind", ["lose", "garble", "disconnect"])
+def test_whichever_answer_fails_the_latch_opens(kind: str) -> None:
+    for ask in ("position", "homed", "moving"):
+        with gcs_rig(Fault(kind, at=0), wire="usb", timeout_s=0.02) as rig:  # type: ignore[arg-type]
+            with pytest.raises(LinkError):
+                rig.stage.moving if ask == "moving" else getattr(rig.stage, ask)()
+            assert not rig.stage.latch.armed, ask
+
+
+@given(seed=st.integers(0, 2**32))
+@settings(max_examples=40, deadline=None)
+def test_under_any_faults_a_position_is_the_true_one_or_a_driver_error(seed: int) -> None:
+    kinds = ("lose", "garble", "error", "disconnect", "stick", "limit", "power_cycle")
+    schedule = FaultSchedule.seeded(seed, count=4, lines=40, kinds=kinds)
+    with gcs_rig(wire="usb") as rig:
+        rig.link.timeout_s = 0.005
+        rig.engine.faults = schedule
+        try:
+            for _ in range(6):
+                rig.stage.set_velocity({"x": 800.0, "y": -600.0}, expires_s=0.25)
+                rig.clock.wait(0.1)
+                read = rig.stage.position()
+                truth = rig.engine.position
+                assert read == pytest.approx({"x": truth["1"] * 1e3, "y": truth["2"] * 1e3}, abs=STEP_UM)
+        except DriverError:
+            pass
+        rig.clock.wait(1.0)
+        rests_at = rig.engine.position  # whatever failed, it expired or was stopped
+        rig.clock.wait(10.0)
+        assert rig.engine.position == rests_at

@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol
@@ -201,11 +201,14 @@ class Stage:
     @property
     def moving(self) -> bool:
         """Whether anything moves."""
-        return self._controller.moving()
+        with self._stopped_on_failure():
+            return self._controller.moving()
 
     def homed(self) -> dict[str, bool]:
         """Say which axes know where they are."""
-        return {self._names[wire]: known for wire, known in self._controller.homed(list(self._names)).items()}
+        with self._stopped_on_failure():
+            homed = self._controller.homed(list(self._names))
+        return {self._names[wire]: known for wire, known in homed.items()}
 
     def position(self) -> dict[str, float]:
         """Read every axis, and compare with what was commanded.
@@ -217,15 +220,10 @@ class Stage:
         LinkError, ReplyError
             No answer, or one that makes no sense; likewise.
         """
-        try:
+        with self._stopped_on_failure():
             read = self._controller.positions(list(self._names))
-            position = {
-                name: read[axis.wire] * axis.scale for name, axis in self.axes.items()
-            }  # in the order of the axes, whatever order the controller answered in
+            position = {name: read[axis.wire] * axis.scale for name, axis in self.axes.items()}
             self._watch.check(self._clock.now_s, position)
-        except (FollowingError, LinkError) as failure:
-            self.emergency_stop(str(failure))
-            raise
         return position
 
     def state(self) -> StageState:
@@ -408,6 +406,15 @@ class Stage:
     ) -> None:
         self.close()
 
+    @contextlib.contextmanager
+    def _stopped_on_failure(self) -> Iterator[None]:
+        """Stop and open the latch where the stage cannot be seen any more, or is not where it should be."""
+        try:
+            yield
+        except (FollowingError, LinkError) as failure:
+            self.emergency_stop(str(failure))
+            raise
+
     def _send(self, courses: Mapping[str, Course], halt: Collection[str], since: int) -> None:
         targets = {self.axes[n].wire: c.target / self.axes[n].scale for n, c in courses.items()}
         speeds = {self.axes[n].wire: c.speed / abs(self.axes[n].scale) for n, c in courses.items()}
@@ -445,8 +452,8 @@ class Stage:
             raise LimitError(f"{name} was asked to move at {speed:g}: 0 to {limit:g} was wanted")
 
     def _require_homed(self, names: Collection[str]) -> None:
-        homed = self._controller.homed([self.axes[name].wire for name in names])
-        lost = [self._names[wire] for wire, known in homed.items() if not known]
+        homed = self.homed()
+        lost = [name for name in names if not homed[name]]
         if lost:
             raise LimitError(f"{', '.join(lost)} does not know where it is: home it first, nothing was moved")
 
