@@ -995,7 +995,14 @@ class _Sight:
     ssd_peg: float
 
 
-def cut_templates(image: Pixels, corners: Array, part: str, seen_turn: Array | None = None) -> list[Template]:
+def cut_templates(
+    image: Pixels,
+    corners: Array,
+    part: str,
+    seen_turn: Array | None = None,
+    *,
+    shape: tuple[int, int] = (20, 20),
+) -> list[Template]:
     """Cut the templates of a part's features where nothing but the part is, each anchored at its corner.
 
     Parameters
@@ -1006,19 +1013,21 @@ def cut_templates(image: Pixels, corners: Array, part: str, seen_turn: Array | N
         The features in it, (x, y).
     seen_turn : (2, 2), optional
         The pictures are turned by this about their corners first: how the camera sees the part turned.
+    shape
+        Rows and columns of each template.
     """
     templates = []
+    middle = corners.mean(axis=0)
     for corner in corners:
-        inward = np.sign(corners.mean(axis=0) - corner)
-        centre = corner + _INSET_PX[part] * inward
-        template = Template.cut(image, centre)
+        centre = corner + _INSET_PX[part] * np.sign(middle - corner)
+        template = Template.cut(image, centre, shape)
         anchor = template.anchor_yx + (corner - centre)[::-1]
         if seen_turn is not None:
             offset = seen_turn @ (centre - corner)
             warp = np.column_stack([seen_turn, corner - seen_turn @ corner])
             turned = cv2.warpAffine(image, warp, image.shape[::-1], flags=cv2.INTER_CUBIC)
             noise = template.noise
-            template = Template.cut(turned, corner + offset, noise=noise)
+            template = Template.cut(turned, corner + offset, shape, noise=noise)
             anchor = template.anchor_yx - offset[::-1]
         templates.append(template.anchored(anchor))
     return templates

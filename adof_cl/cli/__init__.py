@@ -16,7 +16,9 @@ import typer
 from adof_cl import __version__
 from adof_cl.errors import AdofError
 
-COMMANDS: tuple[str, ...] = ("run", "devices", "phase", "otf", "psf", "dof", "restore", "selftest", "bench")
+COMMANDS: tuple[str, ...] = (
+    "run", "tradeoff", "devices", "phase", "otf", "psf", "dof", "restore", "selftest", "bench"
+)  # fmt: skip
 """Modules of this package, in the order `adof --help` lists them."""
 
 
