@@ -18,7 +18,13 @@ from adof_cl.optics import Mask, OpticalSystem, require_finite, require_positive
 from adof_cl.otf_table import OtfTable
 from adof_cl.phase_terms import require_envelope
 from adof_cl.restore import Restore
-from adof_cl.tracking import Measurement, Template, TemplateTracker, TrackingLimits
+from adof_cl.tracking import (
+    Measurement,
+    Template,
+    TemplateTracker,
+    TrackingLimits,
+    checked_refine,
+)
 
 Pixels = NDArray[np.uint8]
 
@@ -144,7 +150,7 @@ class CameraPipeline:
         self.buffers = buffers
         self.tolerance_rad = tolerance_rad
         self._search_shape = search_shape
-        self._refine = refine
+        self._refine = checked_refine(refine)
         self._restore = Restore(
             device, shape, precision=precision, in_dtype=np.uint8, out_dtype=np.uint8, padding=padding,
             spectrum_dtype=spectrum_dtype,
@@ -204,6 +210,19 @@ class CameraPipeline:
             None have been set.
         """
         return list(self._tracker(part).templates)
+
+    def set_refine(self, refine: str) -> None:
+        """Refine places so from the next frame on: "gauss_newton", "quadratic" or "integer".
+
+        Raises
+        ------
+        InputError
+            Another word; nothing changes.
+        """
+        self._refine = checked_refine(refine)
+        for buffer in self._buffers:
+            for tracker in buffer.trackers.values():
+                tracker.refine = refine
 
     def __call__(
         self,
@@ -337,7 +356,7 @@ class Window:
     ----------
     shape
         (rows, columns), no larger than the frame.
-    search_shape, refine, precision, spectrum_dtype, padding
+    search_shape, refine, precision, spectrum_dtype, padding, tolerance_rad
         As in `CameraPipeline`.
     """
 
@@ -347,6 +366,7 @@ class Window:
     precision: str = "float32"
     spectrum_dtype: str | None = None
     padding: int = 64
+    tolerance_rad: float = SAME_RAD
 
 
 class WindowedPipeline:
@@ -361,8 +381,8 @@ class WindowedPipeline:
     shape
         Region of interest, (rows, columns); frames are uint8.
     windows
-        For each part, its window.
-    nsr, tolerance_rad
+        For each part, its window; or several, of which the first is used until `use` names another.
+    nsr
         As in `CameraPipeline`.
 
     Raises
@@ -376,28 +396,34 @@ class WindowedPipeline:
         device: Device,
         optics: OpticalSystem,
         shape: tuple[int, int],
-        windows: Mapping[str, Window],
+        windows: Mapping[str, Window | Sequence[Window]],
         *,
         nsr: float = 0.01,
-        tolerance_rad: float = SAME_RAD,
     ) -> None:
         if not windows:
             raise InputError("no part came: give at least one with its window")
-        for part, window in windows.items():
-            if window.shape[0] > shape[0] or window.shape[1] > shape[1]:
-                raise InputError(
-                    f"the window of '{part}' is {window.shape}, the frame {shape}: it must fit inside"
-                )
         self.shape = shape
         self.parts = tuple(windows)
-        self._pipelines = {
-            part: CameraPipeline(
-                device, optics, window.shape, (part,), nsr=nsr, padding=window.padding,
-                search_shape=window.search_shape, refine=window.refine, precision=window.precision,
-                spectrum_dtype=window.spectrum_dtype, tolerance_rad=tolerance_rad,
-            )
-            for part, window in windows.items()
-        }  # fmt: skip
+        self._made: dict[str, dict[tuple[object, ...], CameraPipeline]] = {}
+        self._taught: dict[str, tuple[Sequence[Template], TrackingLimits | None]] = {}
+        self._learnt: dict[CameraPipeline, tuple[Sequence[Template], TrackingLimits | None]] = {}
+        self._pipelines: dict[str, CameraPipeline] = {}
+        for part, given in windows.items():
+            several = (given,) if isinstance(given, Window) else tuple(given)
+            for window in several:
+                if window.shape[0] > shape[0] or window.shape[1] > shape[1]:
+                    raise InputError(
+                        f"the window of '{part}' is {window.shape}, the frame {shape}: it must fit inside"
+                    )
+            self._made[part] = {
+                _made_for(window): CameraPipeline(
+                    device, optics, window.shape, (part,), nsr=nsr, padding=window.padding,
+                    search_shape=window.search_shape, refine=window.refine, precision=window.precision,
+                    spectrum_dtype=window.spectrum_dtype, tolerance_rad=window.tolerance_rad,
+                )
+                for window in several
+            }  # fmt: skip
+            self._pipelines[part] = self._made[part][_made_for(several[0])]
         self._origins: dict[str, tuple[int, int]] = {}
 
     def set_templates(
@@ -405,6 +431,29 @@ class WindowedPipeline:
     ) -> None:
         """Follow these features of `part` from now on; errors as `CameraPipeline.set_templates`."""
         self._of(part).set_templates(part, templates, limits)
+        self._taught[part] = templates, limits
+        self._learnt[self._of(part)] = self._taught[part]
+
+    def use(self, part: str, window: Window) -> None:
+        """Follow `part` in this window from the next frame on; makes no buffer and compiles nothing.
+
+        `refine` and `tolerance_rad` may be any; the rest is one of the windows the pipeline was made with.
+
+        Raises
+        ------
+        InputError
+            An unknown part, or a window that was not made; nothing changes.
+        """
+        self._of(part)
+        pipeline = self._made[part].get(_made_for(window))
+        if pipeline is None:
+            raise InputError(f"'{part}' has no window like {window}: state it when the pipeline is made")
+        pipeline.set_refine(window.refine)
+        pipeline.tolerance_rad = window.tolerance_rad
+        if part in self._taught and self._learnt.get(pipeline) is not self._taught[part]:
+            pipeline.set_templates(part, *self._taught[part])
+            self._learnt[pipeline] = self._taught[part]
+        self._pipelines[part] = pipeline
 
     def templates(self, part: str) -> list[Template]:
         """Return the features of `part` that are followed now."""
@@ -467,3 +516,8 @@ class WindowedPipeline:
         if part not in self._pipelines:
             raise InputError(f"part '{part}' came: this pipeline follows {', '.join(self.parts)}")
         return self._pipelines[part]
+
+
+def _made_for(window: Window) -> tuple[object, ...]:
+    """What of a window is decided when its pipeline is made."""
+    return window.shape, window.search_shape, window.precision, window.spectrum_dtype, window.padding

@@ -29,7 +29,7 @@ RESTORATIONS = ("none", "half", "float32", "float64")
 REFINES = ("integer", "quadratic", "gauss_newton")
 WINDOWS = (96, 128, 160, 192, 256, 0)
 """Sides of the square window around an object, pixels; 0 is the whole frame."""
-TEMPLATES = (12, 20)
+TEMPLATE_PX = 20
 SEARCHES = (32, 48, 64)
 PADDING = 32
 """Samples added to a window that is restored."""
@@ -121,7 +121,7 @@ class ChainError:
     alpha_rad, share
         The mask, and |psi|/(3 alpha); without a mask `share` is |psi| itself.
     bias_px
-        Without noise; 95 % of objects have no feature farther off.
+        Without noise: the farthest that any object's worst feature was off.
     noise_px
         What noise of `DeviceProfile.noise_grey` adds, in quadrature.
     """
@@ -161,8 +161,8 @@ class DeviceProfile:
         What a second object in the same frame does not pay again.
     mask_s
         Time to compute a mask's panel codes.
-    noise_grey
-        Noise of the frames on which `errors` were measured.
+    noise_grey, nsr
+        Noise of the frames on which `errors` were measured, and of the filters.
     """
 
     schema_version: int
@@ -172,6 +172,7 @@ class DeviceProfile:
     machine: dict[str, Any]
     settings: dict[str, Any]
     noise_grey: float
+    nsr: float
     readings: list[Reading]
     times: list[ChainTime]
     forms: list[FormTime]

@@ -14,7 +14,7 @@ from typing import ClassVar
 import pydantic
 
 from adof_cl.errors import InputError
-from adof_cl.optics import OpticalSystem, require_finite, require_positive
+from adof_cl.optics import Mask, OpticalSystem, require_finite, require_positive
 
 _NOTHING_ELSE = pydantic.ConfigDict(extra="forbid")  # a misspelt name is said, not passed over
 
@@ -30,7 +30,7 @@ class SceneObject:
     depth_um, depth_sigma_um
         Distance beyond the plane in focus without a mask, and its standard deviation.
     extent_px
-        Largest distance between its features along the image's axes.
+        Side of the square about its features' middle that holds the middles of their templates.
     features
         How many are followed.
     place_sigma_px
@@ -79,8 +79,8 @@ class Scene:
         Standard deviation of a frame's noise, of 255.
     shape
         Region of interest, (rows, columns).
-    tilt_deg
-        Angle between the two cameras' lines of sight.
+    mask_2, tilt_deg
+        Camera 2's fixed mask, and how far it looks aside; None: there is no second camera, and no depth.
     """
 
     __pydantic_config__: ClassVar = _NOTHING_ELSE
@@ -89,6 +89,7 @@ class Scene:
     noise_grey: float = 1.3
     frame_rate_hz: float = 60.0
     shape: tuple[int, int] = (400, 512)
+    mask_2: Mask | None = None
     tilt_deg: float = 30.0
     optics: OpticalSystem = field(default_factory=OpticalSystem)
 

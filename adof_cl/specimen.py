@@ -154,14 +154,3 @@ class Specimen:
         matrices, origins = zip(*(self.rig.world.projection(n) for n in (1, 2)), strict=True)
         seen = np.concatenate([first + self._origin_xy - origins[0], second + self._origin_xy - origins[1]])
         return float((np.linalg.pinv(np.vstack(matrices)) @ seen)[2])
-
-
-def extent_px(templates: list[Template], corners_px: Array) -> float:
-    """Return the side of the square about the features' middle that holds their templates' middles."""
-    middle = (corners_px.min(axis=0) + corners_px.max(axis=0)) / 2
-    shape = np.array(templates[0].pixels.shape)
-    offsets = [
-        corner - middle + ((shape - 1) / 2 - template.anchor_yx)[::-1]
-        for corner, template in zip(corners_px, templates, strict=False)
-    ]
-    return float(2 * np.abs(offsets).max())

@@ -17,7 +17,8 @@ from adof_cl.errors import InputError
 from adof_cl.loop import HOLE, PEG
 from adof_cl.profile import DeviceProfile, Reading, kept_at
 from adof_cl.scene import Scene, SceneObject
-from adof_cl.specimen import Specimen, extent_px
+from adof_cl.specimen import Specimen
+from adof_cl.tracking import extent_px
 from adof_cl.turns import Spread
 
 

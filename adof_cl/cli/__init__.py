@@ -17,7 +17,7 @@ from adof_cl import __version__
 from adof_cl.errors import AdofError
 
 COMMANDS: tuple[str, ...] = (
-    "run", "tradeoff", "devices", "phase", "otf", "psf", "dof", "restore", "selftest", "bench"
+    "run", "plan", "tradeoff", "devices", "phase", "otf", "psf", "dof", "restore", "selftest", "bench"
 )  # fmt: skip
 """Modules of this package, in the order `adof --help` lists them."""
 
