@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adof_cl.errors import BudgetError, InputError
+from adof_cl.mask import filter_quality
 from adof_cl.optics import Mask, OpticalSystem, require_positive
 from adof_cl.pipeline import SAME_RAD, Window
 from adof_cl.profile import (
@@ -589,6 +590,13 @@ class Planner:
             f"{1e3 * plan.time_s:.3g} ms, errs by up to {plan.error_um:.2g} um where "
             f"{plan.wanted_um:.3g} are allowed"
         )
+        if chain.restoration != "none":
+            psi = mask.psi_rad(scene.optics, thing.depth_um)
+            quality = filter_quality(scene.optics, mask.alpha_rad, psi, self.profile.nsr)
+            sentence += (
+                f"; restored noise is {quality.noise_gain:.2g} times the frame's, detail is kept to "
+                f"{quality.resolution_lp_per_mm:.0f} lp/mm"
+            )
         cheaper = [
             c
             for c in self.choices(scene, mask, thing, plan.wanted_um)
