@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from adof_cl.cli import main
 from adof_cl.device import Device
 from adof_cl.errors import InputError
 from adof_cl.optics import Mask, OpticalSystem
@@ -105,6 +106,27 @@ def test_a_budget_is_one_of_two() -> None:
     for wrong in ({}, {"max_error_um": 1.0, "max_ms": 1.0}):
         with pytest.raises(InputError, match="give one"):
             Budget(planner, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("--profile", "p.json"), "came without a budget"),
+        (("--max-error-um", "0", "--profile", str(PROFILE)), "max_error_um is 0"),
+        (("--max-ms", "2", "--max-error-um", "2", "--profile", str(PROFILE)), "give one"),
+        (("--max-ms", "2", "--profile", "nowhere.json"), "nowhere.json cannot be read"),
+    ],
+)
+def test_a_run_with_a_budget_that_cannot_be_is_refused_before_anything_is_written(
+    arguments: tuple[str, ...], sentence: str, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(["run", *arguments])
+    assert ended.value.code == 2
+    assert sentence in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_budgeted_loop_sees_as_planned_and_comes_as_near(device: Device) -> None:
