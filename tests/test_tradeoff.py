@@ -113,6 +113,8 @@ def test_a_knob_pays_when_less_accuracy_saves_a_tenth_and_not_otherwise() -> Non
     }  # fmt: skip
     assert "40 % of the chain" in found["refinement"].sentence
     assert "leave it at small" in found["window"].sentence
+    assert "as accurate as large (2.5 ms, 1 um) and 20 % of the chain quicker" in found["window"].sentence
+    assert "as accurate" not in found["filter"].sentence
     assert "no setting follows" in found["pyramid"].sentence
 
 
