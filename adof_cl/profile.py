@@ -66,6 +66,11 @@ class Reading:
     depth_um: float | None = None
     image_l2: float | None = None
 
+    @property
+    def worst_um(self) -> float:
+        """The larger of the errors of place and of depth."""
+        return self.error_um if self.depth_um is None else max(self.error_um, self.depth_um)
+
 
 @dataclass(frozen=True)
 class Chain:

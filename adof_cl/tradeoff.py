@@ -979,12 +979,19 @@ def measure(
 
 
 def pareto(readings: Sequence[Reading]) -> list[Reading]:
-    """Return the readings that no other beats in both time and error, quickest first."""
-    front: list[Reading] = []
-    for reading in sorted(readings, key=lambda r: (r.time_s.median, r.error_um)):
-        if math.isfinite(reading.error_um) and (not front or reading.error_um < front[-1].error_um):
-            front.append(reading)
-    return front
+    """Return the readings that no other beats in both time and error, quickest first.
+
+    Times of whole chains and of a knob's own part are not compared with each other.
+    """
+    fronts: list[Reading] = []
+    for whole in (False, True):
+        least = math.inf
+        mine = [r for r in readings if r.whole_chain == whole]
+        for reading in sorted(mine, key=lambda r: (r.time_s.median, r.worst_um)):
+            if reading.worst_um < least:
+                least = reading.worst_um
+                fronts.append(reading)
+    return fronts
 
 
 @dataclass(frozen=True)
@@ -1017,26 +1024,22 @@ def verdicts(readings: Sequence[Reading]) -> list[Verdict]:
     return found
 
 
-def _error(reading: Reading) -> float:
-    return reading.error_um if reading.depth_um is None else max(reading.error_um, reading.depth_um)
-
-
 def _verdict(stage: str, knob: str, mine: Sequence[Reading], chain_s: float) -> Verdict:
-    usable = [r for r in mine if math.isfinite(_error(r))]
+    usable = [r for r in mine if math.isfinite(r.worst_um)]
     if not usable:
         return Verdict(stage, knob, False, "no setting follows the features in this scene")
-    least = min(_error(r) for r in usable)
-    alike = [r for r in usable if _error(r) <= _ALIKE * least]
+    least = min(r.worst_um for r in usable)
+    alike = [r for r in usable if r.worst_um <= _ALIKE * least]
     quickest = min(alike, key=lambda r: r.time_s.median)
     whole = quickest.time_s.median if quickest.whole_chain else chain_s
     # Of settings that the chain's time cannot tell apart, the most accurate.
     near = [r for r in alike if r.time_s.median - quickest.time_s.median < _UNFELT * whole]
-    best = min(near, key=lambda r: (_error(r), r.image_l2 or 0.0))
+    best = min(near, key=lambda r: (r.worst_um, r.image_l2 or 0.0))
     cheapest = min(usable, key=lambda r: r.time_s.median)
     saving = (best.time_s.median - cheapest.time_s.median) / whole
 
     def at(reading: Reading) -> str:
-        return f"{reading.setting} ({1e3 * reading.time_s.median:.3g} ms, {_error(reading):.2g} um)"
+        return f"{reading.setting} ({1e3 * reading.time_s.median:.3g} ms, {reading.worst_um:.2g} um)"
 
     if saving >= _LEAST_SAVING and best.time_s.apart_from(cheapest.time_s):
         return Verdict(

@@ -145,7 +145,7 @@ def _draw(readings: Sequence[Reading], path: Path, title: str, *, labels: bool =
     figure = Figure(figsize=(10.0, 6.0), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    drawn = [r for r in readings if math.isfinite(r.error_um)]
+    drawn = [r for r in readings if math.isfinite(r.worst_um)]
     front = pareto(drawn)
     knobs = list(dict.fromkeys(r.knob for r in readings))
     numbered = {id(r): number for number, r in enumerate(drawn, start=1)}
@@ -157,8 +157,8 @@ def _draw(readings: Sequence[Reading], path: Path, title: str, *, labels: bool =
             [1e3 * (r.time_s.median - r.time_s.low) for r in mine],
             [1e3 * (r.time_s.high - r.time_s.median) for r in mine],
         ]
-        y = [max(r.error_um, 1e-3) for r in mine]
-        lost = [r.setting for r in readings if r.knob == knob and not math.isfinite(r.error_um)]
+        y = [max(r.worst_um, 1e-3) for r in mine]
+        lost = [r.setting for r in readings if r.knob == knob and not math.isfinite(r.worst_um)]
         label = knob + (f" (features lost: {', '.join(lost)})" if lost else "")
         axes.errorbar(
             x, y, xerr=bars, fmt="o", markersize=4, elinewidth=0.8, color=colours(index), label=label
@@ -168,10 +168,15 @@ def _draw(readings: Sequence[Reading], path: Path, title: str, *, labels: bool =
                 axes.annotate(
                     str(numbered[id(reading)]), at, xytext=(4, 4), textcoords="offset points", fontsize=8
                 )
-    axes.step(
-        [1e3 * r.time_s.median for r in front], [max(r.error_um, 1e-3) for r in front], where="post",
-        color="black", linewidth=0.8, label="no setting beats these in both",
-    )  # fmt: skip
+    for whole in (False, True):
+        steps = [r for r in front if r.whole_chain == whole]
+        if not steps:
+            continue
+        line = "no setting beats these" if whole else "likewise, of a knob's own part"
+        axes.step(
+            [1e3 * r.time_s.median for r in steps], [max(r.worst_um, 1e-3) for r in steps], where="post",
+            color="black", linewidth=0.8, linestyle="-" if whole else ":", label=line,
+        )  # fmt: skip
     axes.set_xscale("log")
     axes.set_yscale("log")
     for axis in (axes.xaxis, axes.yaxis):
@@ -182,7 +187,7 @@ def _draw(readings: Sequence[Reading], path: Path, title: str, *, labels: bool =
         "ms, median and quartiles"
         + ("" if all(r.whole_chain for r in readings) else " (of the knob's own part)")
     )
-    axes.set_ylabel("largest feature error in 95 % of frames, µm at the object")
+    axes.set_ylabel("largest error of place or depth in 95 % of frames, µm at the object")
     axes.set_title(title, fontsize=9)
     axes.grid(which="both", linewidth=0.3)
     axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
