@@ -317,8 +317,8 @@ class Planner:
                 candidates.append((each, chosen))
         if not candidates:
             raise BudgetError(
-                "no mask that was measured covers this scene's depths and noise: bring the objects closer "
-                "together, or state their depths more precisely"
+                "no mask that was measured covers this scene's depths and noise, in both cameras where depth "
+                "is wanted: bring the objects closer together, or state their depths more precisely"
             )
         plans = [self._assembled(scene, each, chosen, wanted) for each, chosen in candidates]
         if max_ms is not None:
@@ -367,7 +367,7 @@ class Planner:
             yield Mask(0.0, -focus)
         for focus in foci:
             reach = max(max(ends) - focus, focus - min(ends))
-            for share in SHARES if focus == middle else SHARES[:1]:
+            for share in SHARES if focus == middle else SHARES[1:2]:
                 yield Mask(max(reach / (3 * share), float(self._errors.alphas[0])), -focus)
 
     # ---- inside -------------------------------------------------------------------------------------------

@@ -898,8 +898,8 @@ def teach_part(pipeline: WindowedPipeline, specimen: Specimen, part: str, side_p
 def _cases(optics: OpticalSystem, alpha: float, share: float, per_um: float) -> list[tuple[str, float, Mask]]:
     """Return parts, depths and masks that show a part with this alpha and |psi| = 3 alpha share."""
     psi = 3 * alpha * share
-    if share == 0:  # in focus, the other as far as the mask covers
-        depth = min(1.8 * alpha / per_um, FARTHEST_UM)
+    if share == 0:  # in focus, the other as far out as the planner lets it be
+        depth = min(3 * 0.45 * alpha / per_um, FARTHEST_UM)
         return [(PEG, depth, Mask(alpha, 0.0)), (HOLE, depth, Mask(alpha, -optics.psi_rad(depth)))]
     depth = min(optics.depth_um(2 * psi), FARTHEST_UM)
     mask = Mask(alpha, psi - optics.psi_rad(depth))

@@ -343,3 +343,11 @@ def test_plans_keep_their_errors_on_scenes_no_profile_was_made_from(device: Devi
     excess = [row["excess"] for row in figures["rows"]]
     # One scene in twenty may miss its budget: two of five would be one run in fifty, and scenes are seeded.
     assert np.sum(np.array(excess) > 1) <= 1
+
+
+@pytest.mark.parametrize("name", ["pocl"])
+def test_the_planners_results_that_are_kept_meet_their_bounds(name: str) -> None:
+    figures = json.loads((TREE / "benchmarks" / "planner" / f"{name}.json").read_text())
+    assert figures["planned"] + figures["refused"] == 200
+    assert figures["kept"] >= 0.95
+    assert all(row["ratio"] >= 3 for row in figures["against_exact"] if not math.isnan(row["ratio"]))
