@@ -155,6 +155,11 @@ class _Errors:
 
         self._plain = table(self.plain, [0.0], flat)[:, :, 0]
         self._restored = table(self.restored, alphas, shares)
+        # In focus an object was measured beside one that is far out. Where that one's blur lost it, an object
+        # that is a little out, beside one no farther, is found: no better than at the next share.
+        lost = (self._restored[:, :, :, 0] >= _LOST_PX).any(axis=(0, 1))
+        self.focused_alpha_rad = float(self.alphas[~lost].max(initial=0.0))
+        self._restored[:, :, lost, 0] = self._restored[:, :, lost, 1]
 
     def without_mask(self, psi_rad: float, noise_grey: float) -> Array:
         """Return the errors (px) of `plain` kinds at a defocus."""
@@ -368,7 +373,9 @@ class Planner:
         for focus in foci:
             reach = max(max(ends) - focus, focus - min(ends))
             for share in SHARES if focus == middle else SHARES[1:2]:
-                yield Mask(max(reach / (3 * share), float(self._errors.alphas[0])), -focus)
+                alpha = max(reach / (3 * share), float(self._errors.alphas[0]))
+                if focus == middle or alpha <= self._errors.focused_alpha_rad:
+                    yield Mask(alpha, -focus)
 
     # ---- inside -------------------------------------------------------------------------------------------
 
