@@ -35,3 +35,11 @@ class StreamError(AdofError):
 
 class LimitError(AdofError):
     """A move or a pattern lies beyond a limit; nothing was sent."""
+
+
+class BudgetError(AdofError):
+    """No plan meets the budget; the message and `nearest` say what comes closest."""
+
+    def __init__(self, sentence: str, nearest: object = None) -> None:
+        super().__init__(sentence)
+        self.nearest = nearest

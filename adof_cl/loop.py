@@ -26,13 +26,15 @@ from adof_cl.device import Device
 from adof_cl.errors import AdofError, InputError, TrackingError
 from adof_cl.mask import ModelCalibration, PaperCalibration, choose_mask
 from adof_cl.optics import Mask, OpticalSystem, SlmPanel
-from adof_cl.pipeline import Blur, CameraPipeline
+from adof_cl.pipeline import Blur, CameraPipeline, WindowedPipeline
 from adof_cl.record import Iteration, Position, RunRecord
 from adof_cl.registration import Drawing, register
+from adof_cl.replan import Budget, Replanner
+from adof_cl.scene import Scene
 from adof_cl.servo import ServoLaw, StageAxes, StageAxis, StageQuantiser, VelocityCommand, jog_test
 from adof_cl.slm_encode import SlmEncode
 from adof_cl.stereo import StereoRig, calibrate_camera, triangulate_relative
-from adof_cl.tracking import Measurement, Template, TrackingLimits
+from adof_cl.tracking import Measurement, Template, TrackingLimits, extent_px
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
@@ -170,6 +172,8 @@ class Options:
         The loop gives up after so many.
     rig_name
         What the cameras are called in a calibration file.
+    budget
+        What the loop's frames may cost or err by; None: everything is restored whole and refined fully.
     """
 
     mask: str = "joint"
@@ -179,6 +183,7 @@ class Options:
     nsr: float = 0.01
     iteration_limit: int = 600
     rig_name: str = "rig"
+    budget: Budget | None = None
 
     def __post_init__(self) -> None:
         if self.mask not in MASKS:
@@ -242,12 +247,24 @@ class Features:
 class _Eye:
     """One camera as the loop uses it: its pipeline, its drawn geometry, the mask its light passes."""
 
-    def __init__(self, number: int, device: Device, design: Design, nsr: float) -> None:
+    def __init__(
+        self, number: int, device: Device, design: Design, nsr: float, budget: Budget | None
+    ) -> None:
         self.number = number
         self.optics = design.optics_1 if number == 1 else design.optics_2
         self.pipeline = CameraPipeline(
             device, self.optics, (design.region_rows, design.region_columns), (PEG, HOLE), nsr=nsr
         )
+        self.replanner: Replanner | None = None
+        if budget is not None:
+            self.replanner = Replanner(
+                device, self.optics, self.pipeline.shape, (PEG, HOLE), budget,
+                frame_rate_hz=design.frame_rate_hz,
+            )  # fmt: skip
+        self.extent_px: dict[str, float] = {}
+        self._templates: dict[str, Sequence[Template]] = {}
+        self._limits: dict[str, TrackingLimits] = {}
+        self._learnt: dict[tuple[CameraPipeline | WindowedPipeline, str], Sequence[Template]] = {}
         matrix, origin = design.projection(number)
         self.matrix: Array = np.asarray(matrix, dtype=np.float64)
         self.origin: Array = np.asarray(origin, dtype=np.float64) - np.array(design.region_origin_yx[::-1])
@@ -263,17 +280,51 @@ class _Eye:
 
     def blur(self, world_um: Array) -> Blur:
         """Return what this camera's optics do to a part at a place, as drawn."""
-        return Blur.of(self.mask, self.optics, float(self.depth_axis @ world_um))
+        return Blur.of(self.mask, self.optics, self.depth_um(world_um))
 
     def project(self, world_um: Array) -> Array:
         """Return where the drawing says a place is seen."""
         return np.asarray(self.matrix @ world_um + self.origin)
 
+    def depth_um(self, world_um: Array) -> float:
+        """Return how far a place lies beyond this camera's plane in focus, as drawn."""
+        return float(self.depth_axis @ world_um)
+
+    def set_templates(
+        self, part: str, templates: Sequence[Template], limits: TrackingLimits | None = None
+    ) -> None:
+        """Follow these features of a part; a pipeline learns them when it is next used."""
+        limits = limits or self._limits.get(part)
+        self._templates[part] = templates
+        if limits is not None:
+            self._limits[part] = limits
+
+    def templates(self, part: str) -> Sequence[Template]:
+        """Return the features of a part that are followed now."""
+        return self._templates[part]
+
+    def _taught(self, pipeline: CameraPipeline | WindowedPipeline) -> CameraPipeline | WindowedPipeline:
+        for part, templates in self._templates.items():
+            if self._learnt.get((pipeline, part)) is not templates:
+                pipeline.set_templates(part, templates, self._limits.get(part))
+                self._learnt[pipeline, part] = templates
+        return pipeline
+
     def measure(
-        self, frame: Pixels, blurs: Mapping[str, Blur | None], expected: Mapping[str, Array]
+        self,
+        frame: Pixels,
+        blurs: Mapping[str, Blur | None],
+        expected: Mapping[str, Array],
+        *,
+        planned: bool = False,
     ) -> dict[str, Features]:
-        """Measure parts; remembers where they were seen."""
-        found = self.pipeline(frame, blurs, expected)
+        """Measure parts, as planned or as precisely as can be; remembers where they were seen."""
+        if planned and self.replanner is not None:
+            unrestored = self.replanner.unrestored
+            as_planned = {part: None if part in unrestored else blur for part, blur in blurs.items()}
+            found = self._taught(self.replanner.pipeline)(frame, as_planned, expected)
+        else:
+            found = self._taught(self.pipeline)(frame, blurs, expected)
         for part, measured in found.items():
             covariance = np.stack([m.covariance for m in measured])
             # A lost feature stays where it was expected, and weighs next to nothing.
@@ -324,8 +375,8 @@ class Assembly:
         self._reached = milestone or (lambda _stage: None)
         self._encoder = SlmEncode(device, design.panel, design.optics_1)
         self.eyes = (
-            _Eye(1, device, design, self.options.nsr),
-            _Eye(2, device, design, self.options.nsr),
+            _Eye(1, device, design, self.options.nsr, self.options.budget),
+            _Eye(2, device, design, self.options.nsr, self.options.budget),
         )
         self._model = ModelCalibration(design.optics_1)
         self._calibration = PaperCalibration()
@@ -489,7 +540,9 @@ class Assembly:
         eye.pictures[part] = image
         eye.turned_rad[part] = 0.0
         eye.taught_at_rad = self.rig.coarse.position()["theta"]
-        eye.pipeline.set_templates(part, cut_templates(image, corners, part), TrackingLimits(mismatch=0.7))
+        templates = cut_templates(image, corners, part)
+        eye.set_templates(part, templates, TrackingLimits(mismatch=0.7))
+        eye.extent_px[part] = extent_px(templates, corners)
 
     def _turn_templates(self) -> None:
         """Turn the hole's templates with the hole, as each camera sees a turn."""
@@ -503,7 +556,7 @@ class Assembly:
             block = eye.matrix[:, :2]
             seen = block @ np.array([[c, -s], [s, c]]) @ np.linalg.inv(block)
             corners = eye.taught[HOLE].xy_px
-            eye.pipeline.set_templates(HOLE, cut_templates(eye.pictures[HOLE], corners, HOLE, seen))
+            eye.set_templates(HOLE, cut_templates(eye.pictures[HOLE], corners, HOLE, seen))
 
     def _window(self, centre_xy: Array, half: int) -> tuple[slice, slice]:
         rows, columns = self.design.region_rows, self.design.region_columns
@@ -789,6 +842,10 @@ class Assembly:
         """Choose the mask for where the parts are; a mask that is as good stays, for changing costs time."""
         peg, hole = float(self.world[PEG][2]), float(self.world[HOLE][2])
         wanted = self.mask_for(min(peg, hole, 0.0), max(peg, hole))
+        eye = self.eyes[0]
+        if eye.replanner is not None:
+            plan = eye.replanner.plan(*self._to_see(eye))
+            wanted = wanted if plan is None else plan.mask
         now = self.eyes[0].mask
         close = (
             abs(wanted.alpha_rad - now.alpha_rad) < 0.25
@@ -821,7 +878,8 @@ class Assembly:
             expected = {part: eye.seen[part].xy_px for part in (PEG, HOLE)}
             expected[HOLE] = expected[HOLE] + eye.matrix @ self._last_move_um
             blurs = {part: eye.blur(self.world[part]) for part in (PEG, HOLE)}
-            eye.measure(frame.pixels, blurs, expected)
+            self._replan(eye)
+            eye.measure(frame.pixels, blurs, expected, planned=True)
         seen = [eye.seen for eye in self.eyes]
         lost_peg, lost_hole = (sum(s[part].lost for s in seen) for part in (PEG, HOLE))
         fix = triangulate_relative(
@@ -872,6 +930,22 @@ class Assembly:
             ssd_hole=float(np.mean([m.ssd for m in hole.measured])),
             ssd_peg=float(np.mean([m.ssd for m in peg.measured])),
         )
+
+    def _replan(self, eye: _Eye) -> None:
+        """Choose how this camera's parts are followed: for where they are, through the mask in force."""
+        if eye.replanner is None:
+            return
+        # What was lost is looked for as carefully as can be.
+        plan = None if self._lost_in_a_row else eye.replanner.plan(*self._to_see(eye), eye.mask)
+        eye.replanner.choose(plan)
+
+    def _to_see(self, eye: _Eye) -> tuple[Scene, float]:
+        """Return the scene of one camera, and how far the hole has still to go in depth."""
+        assert eye.replanner is not None
+        depths = {part: eye.depth_um(self.world[part]) for part in (PEG, HOLE)}
+        speed = abs(float(self._last_move_um[2])) * self.design.frame_rate_hz
+        left_um = abs(float(self.world[HOLE][2] - self.world[PEG][2])) - self.options.stand_off_um
+        return eye.replanner.scene(depths, eye.extent_px, speed), max(left_um, 0.0)
 
     def _fused_depth_um(self, sight: _Sight) -> float:
         """Return the depth from the z stage, tied to vision by the last frames.
@@ -955,7 +1029,12 @@ class Assembly:
             self._positions_left = self._positions_left[
                 1 + [p[0] for p in self._positions_left].index(name) :
             ]
-            images = self.eyes[0].pipeline.last_images()
+            eye = self.eyes[0]
+            if eye.replanner is None:
+                images = eye.pipeline.last_images()
+            else:  # a picture of the whole frame, which no plan restores
+                blurs = {part: eye.blur(self.world[part]) for part in (PEG, HOLE)}
+                images = eye.pipeline.restored(sight.frame.pixels, blurs)
             bias = np.array(iteration.hole_bias_px) * self.design.optics_1.object_pitch_um
             depth = iteration.true_depth_um
             self.record.positions.append(
@@ -995,7 +1074,14 @@ class _Sight:
     ssd_peg: float
 
 
-def cut_templates(image: Pixels, corners: Array, part: str, seen_turn: Array | None = None) -> list[Template]:
+def cut_templates(
+    image: Pixels,
+    corners: Array,
+    part: str,
+    seen_turn: Array | None = None,
+    *,
+    shape: tuple[int, int] = (20, 20),
+) -> list[Template]:
     """Cut the templates of a part's features where nothing but the part is, each anchored at its corner.
 
     Parameters
@@ -1006,19 +1092,21 @@ def cut_templates(image: Pixels, corners: Array, part: str, seen_turn: Array | N
         The features in it, (x, y).
     seen_turn : (2, 2), optional
         The pictures are turned by this about their corners first: how the camera sees the part turned.
+    shape
+        Rows and columns of each template.
     """
     templates = []
+    middle = corners.mean(axis=0)
     for corner in corners:
-        inward = np.sign(corners.mean(axis=0) - corner)
-        centre = corner + _INSET_PX[part] * inward
-        template = Template.cut(image, centre)
+        centre = corner + _INSET_PX[part] * np.sign(middle - corner)
+        template = Template.cut(image, centre, shape)
         anchor = template.anchor_yx + (corner - centre)[::-1]
         if seen_turn is not None:
             offset = seen_turn @ (centre - corner)
             warp = np.column_stack([seen_turn, corner - seen_turn @ corner])
             turned = cv2.warpAffine(image, warp, image.shape[::-1], flags=cv2.INTER_CUBIC)
             noise = template.noise
-            template = Template.cut(turned, corner + offset, noise=noise)
+            template = Template.cut(turned, corner + offset, shape, noise=noise)
             anchor = template.anchor_yx - offset[::-1]
         templates.append(template.anchored(anchor))
     return templates

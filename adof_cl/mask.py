@@ -300,6 +300,53 @@ def depth_to_cover_um(near_um: float, far_um: float, optics: OpticalSystem, *, j
         ) from refusal
 
 
+@dataclass(frozen=True)
+class FilterQuality:
+    """What a Wiener filter for one blur does to noise and to detail.
+
+    Attributes
+    ----------
+    noise_gain
+        Standard deviation of the restored image's noise over the frame's, for white noise.
+    resolution_lp_per_mm
+        Finest pattern along an axis, at the object, up to which every one keeps half of its contrast between
+        scene and restored image. At most the sensor's own limit.
+    """
+
+    noise_gain: float
+    resolution_lp_per_mm: float
+
+
+def filter_quality(
+    optics: OpticalSystem, alpha_rad: float, psi_rad: float, nsr: float, *, samples: int = 256
+) -> FilterQuality:
+    """Predict what restoring with the exact filter of a blur does to noise and to detail.
+
+    Parameters
+    ----------
+    nsr
+        Noise-to-signal power of the filter, above 0.
+    samples
+        Frequencies along each axis.
+
+    Source
+    ------
+    docs/maths.md, eqs. W12 and W13.
+    """
+    require_finite(alpha_rad=alpha_rad, psi_rad=psi_rad)
+    require_positive(nsr=nsr)
+    # alpha < 0 is the conjugate of alpha > 0 at -psi, and neither sign changes the modulus.
+    nu = (np.arange(samples) + 0.5) / (2 * samples)  # cycles a pixel, to the sensor's limit
+    u = 2 * nu / optics.object_pitch_um * optics.wavelength_um * optics.f_number
+    inside = np.minimum(u, 2 - 1e-9)
+    h = _modulus(inside, np.full(samples, abs(alpha_rad)), np.full(samples, abs(psi_rad))) * (u < 2)
+    power = np.outer(h * h, h * h)
+    noise_gain = math.sqrt(float(np.mean(power / (power + nsr) ** 2)))
+    below = np.flatnonzero(h * h < nsr)
+    finest = float(nu[below[0]]) if below.size else 0.5
+    return FilterQuality(noise_gain, 1000 * finest / optics.object_pitch_um)
+
+
 def _focus(near_um: float, far_um: float, optics: OpticalSystem) -> float:
     return 0.0 - (optics.psi_rad(near_um) + optics.psi_rad(far_um)) / 2  # not -0
 

@@ -7,25 +7,31 @@ one small download. Nothing else crosses to the host. A frame at a time, or as t
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError, TrackingError
-from adof_cl.optics import Mask, OpticalSystem, require_finite
+from adof_cl.optics import Mask, OpticalSystem, require_finite, require_positive
 from adof_cl.otf_table import OtfTable
 from adof_cl.phase_terms import require_envelope
 from adof_cl.restore import Restore
-from adof_cl.tracking import Measurement, Template, TemplateTracker, TrackingLimits
+from adof_cl.tracking import (
+    Measurement,
+    Template,
+    TemplateTracker,
+    TrackingLimits,
+    checked_refine,
+)
 
 Pixels = NDArray[np.uint8]
 
 
 # A filter is formed anew when alpha or psi moved by more: within |psi| < 3 |alpha| the image shifts by at
 # most 2 x 0.154 px per radian of either (docs/maths.md, eq. O7), here 0.003 px.
-_SAME_RAD = 0.01
+SAME_RAD = 0.01
 
 
 @dataclass(frozen=True)
@@ -41,12 +47,12 @@ class Blur:
         require_finite(depth_um=depth_um)
         return cls(mask.alpha_rad, mask.psi_rad(optics, depth_um))
 
-    def near(self, other: Blur | None) -> bool:
-        """Whether the other's filter serves this blur as well."""
+    def near(self, other: Blur | None, tolerance_rad: float = SAME_RAD) -> bool:
+        """Whether the other's filter serves this blur as well, to a tolerance in alpha and in psi."""
         return (
             other is not None
-            and abs(self.alpha_rad - other.alpha_rad) <= _SAME_RAD
-            and abs(self.psi_rad - other.psi_rad) <= _SAME_RAD
+            and abs(self.alpha_rad - other.alpha_rad) <= tolerance_rad
+            and abs(self.psi_rad - other.psi_rad) <= tolerance_rad
         )
 
 
@@ -107,6 +113,12 @@ class CameraPipeline:
         Samples added to each axis at least: the widest blur expected.
     search_shape
         Window in which each template is searched.
+    refine
+        "gauss_newton", "quadratic" or "integer", as in `TemplateTracker`.
+    precision, spectrum_dtype
+        Of the restoration, as in `Restore`.
+    tolerance_rad
+        A filter is formed anew when alpha or psi moved by more.
     buffers
         Frames that can be under way at once.
     """
@@ -121,21 +133,32 @@ class CameraPipeline:
         nsr: float = 0.01,
         padding: int = 64,
         search_shape: tuple[int, int] = (64, 64),
+        refine: str = "gauss_newton",
+        precision: str = "float32",
+        spectrum_dtype: DTypeLike | None = None,
+        tolerance_rad: float = SAME_RAD,
         buffers: int = 1,
     ) -> None:
         if buffers < 1:
             raise InputError(f"buffers is {buffers}: at least 1 was wanted")
+        require_positive(tolerance_rad=tolerance_rad)
         self.device = device
         self.optics = optics
         self.shape = shape
         self.parts = tuple(parts)
         self.nsr = nsr
         self.buffers = buffers
+        self.tolerance_rad = tolerance_rad
         self._search_shape = search_shape
-        self._restore = Restore(device, shape, in_dtype=np.uint8, out_dtype=np.uint8, padding=padding)
+        self._refine = checked_refine(refine)
+        self._restore = Restore(
+            device, shape, precision=precision, in_dtype=np.uint8, out_dtype=np.uint8, padding=padding,
+            spectrum_dtype=spectrum_dtype,
+        )  # fmt: skip
         # The pixel's own transfer stays in the image, as it is in the templates.
         self._otf = {
-            part: OtfTable(device, optics, self._restore.padded_shape, pixel=False) for part in self.parts
+            part: OtfTable(device, optics, self._restore.padded_shape, pixel=False, precision=precision)
+            for part in self.parts
         }
         self._buffers = [
             _Buffer(
@@ -160,7 +183,9 @@ class CameraPipeline:
         if any(buffer.in_flight for buffer in self._buffers):
             raise InputError("frames are under way: collect them before the templates change")
         trackers = [buffer.trackers[part] for buffer in self._buffers if part in buffer.trackers]
-        if trackers and len(trackers[0].templates) == len(templates):
+        if trackers and [t.pixels.shape for t in trackers[0].templates] == [
+            t.pixels.shape for t in templates
+        ]:
             for index, template in enumerate(templates):
                 for tracker in trackers:
                     tracker.replace(index, template)
@@ -168,7 +193,9 @@ class CameraPipeline:
                 tracker.limits = limits or tracker.limits
             return
         made = [
-            TemplateTracker(self.device, self.shape, templates, self._search_shape, limits=limits)
+            TemplateTracker(
+                self.device, self.shape, templates, self._search_shape, refine=self._refine, limits=limits
+            )
             for _ in self._buffers
         ]
         for buffer, tracker in zip(self._buffers, made, strict=True):
@@ -183,6 +210,19 @@ class CameraPipeline:
             None have been set.
         """
         return list(self._tracker(part).templates)
+
+    def set_refine(self, refine: str) -> None:
+        """Refine places so from the next frame on: "gauss_newton", "quadratic" or "integer".
+
+        Raises
+        ------
+        InputError
+            Another word; nothing changes.
+        """
+        self._refine = checked_refine(refine)
+        for buffer in self._buffers:
+            for tracker in buffer.trackers.values():
+                tracker.refine = refine
 
     def __call__(
         self,
@@ -283,7 +323,7 @@ class CameraPipeline:
             if blur is None:
                 continue
             slot = self.parts.index(part)
-            if not blur.near(self._blurs.get(part)):
+            if not blur.near(self._blurs.get(part), self.tolerance_rad):
                 table = self._otf[part]
                 table.update([(blur.alpha_rad, blur.psi_rad)])
                 self._restore.set_filter_table(table.out, self.nsr, slot)
@@ -306,3 +346,178 @@ class CameraPipeline:
     def _require_part(self, part: str) -> None:
         if part not in self.parts:
             raise InputError(f"part '{part}' came: this pipeline follows {', '.join(self.parts)}")
+
+
+@dataclass(frozen=True)
+class Window:
+    """How one part is followed in a window of its own.
+
+    Attributes
+    ----------
+    shape
+        (rows, columns), no larger than the frame.
+    search_shape, refine, precision, spectrum_dtype, padding, tolerance_rad
+        As in `CameraPipeline`.
+    """
+
+    shape: tuple[int, int]
+    search_shape: tuple[int, int] = (64, 64)
+    refine: str = "gauss_newton"
+    precision: str = "float32"
+    spectrum_dtype: str | None = None
+    padding: int = 64
+    tolerance_rad: float = SAME_RAD
+
+
+class WindowedPipeline:
+    """Restore and search only a window around each part: the frame's other pixels never reach the device.
+
+    Built once; a call cuts each part's window about its expected features, enqueues all of them, then waits.
+
+    Parameters
+    ----------
+    device, optics
+        As in `CameraPipeline`.
+    shape
+        Region of interest, (rows, columns); frames are uint8.
+    windows
+        For each part, its window; or several, of which the first is used until `use` names another.
+    nsr
+        As in `CameraPipeline`.
+
+    Raises
+    ------
+    InputError
+        No part, or a window larger than the frame.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        optics: OpticalSystem,
+        shape: tuple[int, int],
+        windows: Mapping[str, Window | Sequence[Window]],
+        *,
+        nsr: float = 0.01,
+    ) -> None:
+        if not windows:
+            raise InputError("no part came: give at least one with its window")
+        self.shape = shape
+        self.parts = tuple(windows)
+        self._made: dict[str, dict[tuple[object, ...], CameraPipeline]] = {}
+        self._taught: dict[str, tuple[Sequence[Template], TrackingLimits | None]] = {}
+        self._learnt: dict[CameraPipeline, tuple[Sequence[Template], TrackingLimits | None]] = {}
+        self._pipelines: dict[str, CameraPipeline] = {}
+        for part, given in windows.items():
+            several = (given,) if isinstance(given, Window) else tuple(given)
+            for window in several:
+                if window.shape[0] > shape[0] or window.shape[1] > shape[1]:
+                    raise InputError(
+                        f"the window of '{part}' is {window.shape}, the frame {shape}: it must fit inside"
+                    )
+            self._made[part] = {
+                _made_for(window): CameraPipeline(
+                    device, optics, window.shape, (part,), nsr=nsr, padding=window.padding,
+                    search_shape=window.search_shape, refine=window.refine, precision=window.precision,
+                    spectrum_dtype=window.spectrum_dtype, tolerance_rad=window.tolerance_rad,
+                )
+                for window in several
+            }  # fmt: skip
+            self._pipelines[part] = self._made[part][_made_for(several[0])]
+        self._origins: dict[str, tuple[int, int]] = {}
+
+    def set_templates(
+        self, part: str, templates: Sequence[Template], limits: TrackingLimits | None = None
+    ) -> None:
+        """Follow these features of `part` from now on; errors as `CameraPipeline.set_templates`."""
+        self._of(part).set_templates(part, templates, limits)
+        self._taught[part] = templates, limits
+        self._learnt[self._of(part)] = self._taught[part]
+
+    def use(self, part: str, window: Window) -> None:
+        """Follow `part` in this window from the next frame on; makes no buffer and compiles nothing.
+
+        `refine` and `tolerance_rad` may be any; the rest is one of the windows the pipeline was made with.
+
+        Raises
+        ------
+        InputError
+            An unknown part, or a window that was not made; nothing changes.
+        """
+        self._of(part)
+        pipeline = self._made[part].get(_made_for(window))
+        if pipeline is None:
+            raise InputError(f"'{part}' has no window like {window}: state it when the pipeline is made")
+        pipeline.set_refine(window.refine)
+        pipeline.tolerance_rad = window.tolerance_rad
+        if part in self._taught and self._learnt.get(pipeline) is not self._taught[part]:
+            pipeline.set_templates(part, *self._taught[part])
+            self._learnt[pipeline] = self._taught[part]
+        self._pipelines[part] = pipeline
+
+    def templates(self, part: str) -> list[Template]:
+        """Return the features of `part` that are followed now."""
+        return self._of(part).templates(part)
+
+    def __call__(
+        self,
+        frame: Pixels,
+        blurs: Mapping[str, Blur | None],
+        expected_xy_px: Mapping[str, ArrayLike],
+    ) -> dict[str, list[Measurement]]:
+        """Measure every part's features in one frame; places are those of the whole frame.
+
+        Raises
+        ------
+        InputError
+            Another shape or type, an unknown part, one without an expected place; nothing is enqueued.
+        """
+        if frame.shape != self.shape:
+            raise InputError(f"the frame is {frame.shape}: {self.shape} was wanted")
+        for part, blur in blurs.items():
+            pipeline = self._of(part)
+            if part not in expected_xy_px:
+                raise InputError(f"part '{part}' has no expected place: give one for every part of blurs")
+            expected = np.array(expected_xy_px[part], dtype=np.float64)
+            y, x = self._origin(expected, pipeline.shape)
+            rows, columns = pipeline.shape
+            cut = np.ascontiguousarray(frame[y : y + rows, x : x + columns])
+            pipeline.stage(0, Shot(cut, {part: blur}, {part: expected - (x, y)}))
+            self._origins[part] = (y, x)
+        for part in blurs:
+            self._pipelines[part].enqueue(0)
+        measured = {}
+        for part in blurs:
+            y, x = self._origins[part]
+            measured[part] = [
+                replace(m, feature_xy_px=m.feature_xy_px + np.array([x, y]))
+                for m in self._pipelines[part].collect(0)[part]
+            ]
+        return measured
+
+    def last_windows(self) -> dict[str, tuple[tuple[int, int], Pixels]]:
+        """Return each restored part's window: (row, column) of its first pixel in the frame, and pixels."""
+        return {
+            part: (self._origins[part], pipeline.last_images()[part])
+            for part, pipeline in self._pipelines.items()
+            if part in pipeline.last_images()
+        }
+
+    def _origin(self, expected: NDArray[np.float64], window: tuple[int, int]) -> tuple[int, int]:
+        """Return the (row, column) at which a window about these places begins, inside the frame."""
+        if expected.ndim != 2 or not np.isfinite(expected).all():
+            raise InputError(f"expected places of shape {expected.shape} came: (k, 2) finite were wanted")
+        middle = (expected.min(axis=0) + expected.max(axis=0)) / 2
+        first = np.rint(middle[::-1] - (np.array(window) - 1) / 2)
+        y, x = np.clip(first, 0, np.subtract(self.shape, window)).astype(int).tolist()
+        return y, x
+
+    def _of(self, part: str) -> CameraPipeline:
+        if part not in self._pipelines:
+            raise InputError(f"part '{part}' came: this pipeline follows {', '.join(self.parts)}")
+        return self._pipelines[part]
+
+
+def _made_for(window: Window) -> tuple[object, ...]:
+    """What of a window is decided when its pipeline is made."""
+    return window.shape, window.search_shape, window.precision, window.spectrum_dtype, window.padding

@@ -132,7 +132,7 @@ def survey(
         tell("compare", f"position {name}, {depth_um:.0f} µm")
         assembly.bring_hole_to(depth_um)
         for part in (PEG, HOLE):
-            pipeline.set_templates(part, eye.pipeline.templates(part), anything)
+            pipeline.set_templates(part, eye.templates(part), anything)
         results += [_measured(assembly, pipeline, name, arm, truth_px, usual) for arm in arms]
     assembly.move_hole(start)
     return results

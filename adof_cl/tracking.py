@@ -227,6 +227,17 @@ class Template:
         return replace(self, anchor_yx=np.asarray(anchor_yx, dtype=np.float64))
 
 
+def extent_px(templates: Sequence[Template], corners_px: Array) -> float:
+    """Return the side of the square about the features' middle that holds their templates' middles."""
+    middle = (corners_px.min(axis=0) + corners_px.max(axis=0)) / 2
+    shape = np.array(templates[0].pixels.shape)
+    offsets = [
+        corner - middle + ((shape - 1) / 2 - template.anchor_yx)[::-1]
+        for corner, template in zip(corners_px, templates, strict=False)
+    ]
+    return float(2 * np.abs(offsets).max())
+
+
 def estimate_noise(image: NDArray[Any]) -> float:
     """Estimate the standard deviation of white noise, blind to planes and to edges along an axis.
 
@@ -468,13 +479,11 @@ class TemplateTracker:
     ) -> None:
         if not templates:
             raise InputError("no template came: give at least one")
-        if refine not in _LEFT_PX2:
-            raise InputError(f"refine is '{refine}': choose 'gauss_newton', 'quadratic' or 'integer'")
         kinds = {(t.pixels.shape, t.pixels.dtype.name) for t in templates}
         if len(kinds) > 1:
             raise InputError(f"templates of several kinds came, {sorted(kinds)}: cut all alike")
         self.templates = list(templates)
-        self.refine = refine
+        self.refine = checked_refine(refine)
         self.limits = limits or TrackingLimits()
         self.dtype = templates[0].pixels.dtype
         self.full_scale = full_scale or _full_scale(self.dtype)
@@ -642,6 +651,13 @@ class TemplateTracker:
         if limits.displacement_px is not None and distance > limits.displacement_px:
             return f"it moved {distance:.1f} px from where it was expected"
         return ""
+
+
+def checked_refine(refine: str) -> str:
+    """Return `refine`; InputError unless it is "gauss_newton", "quadratic" or "integer"."""
+    if refine not in _LEFT_PX2:
+        raise InputError(f"refine is '{refine}': choose 'gauss_newton', 'quadratic' or 'integer'")
+    return refine
 
 
 def _full_scale(dtype: DTypeLike) -> float:

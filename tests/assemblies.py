@@ -15,9 +15,8 @@ from adof_cl.cli.run import Truth
 from adof_cl.device import Device
 from adof_cl.loop import HOLE, PEG, PEG_OVER_HOLE, Assembly, Options
 from adof_cl.record import RunRecord
+from adof_cl.replan import Budget
 from adof_cl.twin.parts import drawing_of
-
-PARTS = (PEG, HOLE)
 
 
 @dataclass
@@ -34,7 +33,7 @@ class Rehearsal:
     _stood: dict[str, dict[str, float]] = field(default_factory=dict)
 
     @classmethod
-    def new(cls, device: Device, seed: int) -> Rehearsal:
+    def new(cls, device: Device, seed: int, budget: Budget | None = None) -> Rehearsal:
         rig = twins.build(seed)
         for camera in (rig.camera_1, rig.camera_2):
             camera.set_centred_region()
@@ -44,7 +43,7 @@ class Rehearsal:
             HOLE: drawing_of(rig.design.hole),
         }
         record = RunRecord(seed, str(device.facts))
-        options = Options(rig_name=f"twin {seed}")
+        options = Options(rig_name=f"twin {seed}", budget=budget)
         truth = Truth(rig, record, options)
         assembly = Assembly(device, rig, rig.design, drawings, record, options=options)
         made = cls(rig, assembly, record, truth)
@@ -81,9 +80,6 @@ class Rehearsal:
         assembly = self.assembly
         self._stood = self.positions()
         self._state = [_shallow(vars(thing)) for thing in (assembly, *assembly.eyes)]
-        for state, eye in zip(self._state[1:], assembly.eyes, strict=True):
-            state["_templates"] = {part: eye.pipeline.templates(part) for part in PARTS}
-            state["_limits"] = {part: eye.pipeline._tracker(part).limits for part in PARTS}
 
     def wind_back(self) -> RunRecord:
         """Bring parts and assembly back to the moment kept, out of the hole first; returns a new record."""
@@ -95,12 +91,10 @@ class Rehearsal:
         self.rig.fine.wait_until_still()
         assembly = self.assembly
         for thing, state in zip((assembly, *assembly.eyes), self._state, strict=True):
-            kept = _shallow(state)
-            templates, limits = kept.pop("_templates", {}), kept.pop("_limits", {})
             vars(thing).clear()
-            vars(thing).update(kept)
-            for part in templates:
-                thing.pipeline.set_templates(part, templates[part], limits[part])
+            vars(thing).update(_shallow(state))
+        for eye in assembly.eyes:
+            eye._learnt.clear()  # the pipelines have learnt other templates since
         assembly._shown = False
         record = RunRecord(self.record.seed, self.record.device)
         assembly.record = record

@@ -161,7 +161,17 @@ def test_every_header_compiles_alone(path: Path, device: Device) -> None:
         (
             "the reference page is",
             "source_modules",
-            {"cli", "twin", "selftest", "envelope", "bench", "bench_cases", "reference"},
+            {
+                "cli",
+                "twin",
+                "selftest",
+                "envelope",
+                "bench",
+                "bench_cases",
+                "specimen",
+                "tradeoff",
+                "reference",
+            },
         ),
         ("the twin shares nothing", "forbidden_modules", {"twin", "optics", "reference", "errors"}),
         ("only device and program", "source_modules", {"device", "program"}),

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adof_cl import reference
+from adof_cl.device import Device
 from adof_cl.errors import InputError, LimitError
 from adof_cl.mask import (
     PAPER_POINTS,
@@ -17,8 +18,10 @@ from adof_cl.mask import (
     PaperCalibration,
     choose_mask,
     depth_to_cover_um,
+    filter_quality,
 )
 from adof_cl.optics import OpticalSystem
+from adof_cl.restore import Restore
 
 OPTICS = OpticalSystem()
 PAPER = PaperCalibration()
@@ -174,3 +177,36 @@ def test_ranges_that_cannot_be_are_refused() -> None:
 def test_a_pattern_that_is_never_visible_is_refused(options: dict[str, float]) -> None:
     with pytest.raises(InputError, match="even in focus"):
         ModelCalibration(**options)  # type: ignore[arg-type] # floats by name
+
+
+@pytest.mark.parametrize(("alpha", "psi", "nsr"), [(10.0, 0.0, 0.01), (30.0, 20.0, 0.003), (0.0, 4.0, 0.1)])
+def test_restored_noise_is_as_much_stronger_as_predicted(
+    device: Device, alpha: float, psi: float, nsr: float
+) -> None:
+    shape = (256, 256)
+    restore = Restore(device, shape)
+    axis = reference.otf_1d(OPTICS.frequency_axis(256), alpha, psi)
+    axis[128] = axis[128].real
+    restore.set_filter_axes(axis, axis, nsr)
+    noise = np.random.default_rng(1).normal(size=shape).astype(np.float32)
+    gain = float(restore.restore(noise).std() / noise.std())
+    # The sum over 65536 frequencies of a weight of a few thousand strong ones: 1/sqrt(2000) is 2 %.
+    predicted = filter_quality(OPTICS, alpha, psi, nsr).noise_gain
+    assert gain == pytest.approx(predicted, rel=0.05)
+    assert filter_quality(OPTICS, -alpha, psi, nsr) == filter_quality(OPTICS, alpha, -psi, nsr)
+
+
+@given(alpha=st.floats(0, 100), psi=st.floats(0, 60), nsr=st.floats(1e-4, 1), more=st.floats(1, 100))
+def test_less_noise_let_through_costs_detail(alpha: float, psi: float, nsr: float, more: float) -> None:
+    fine, smooth = (filter_quality(OPTICS, alpha, psi, n) for n in (nsr, nsr * more))
+    assert smooth.noise_gain <= fine.noise_gain * (1 + 1e-12)
+    assert smooth.resolution_lp_per_mm <= fine.resolution_lp_per_mm
+    # No filter amplifies any frequency by more than 1 / (2 sqrt(nsr)).
+    assert fine.noise_gain <= 0.5 / math.sqrt(nsr) * (1 + 1e-12)
+    assert 0 < fine.resolution_lp_per_mm <= 500 / OPTICS.object_pitch_um
+
+
+def test_a_filter_that_cannot_be_is_refused() -> None:
+    for wrong in ((math.nan, 0.0, 0.01), (1.0, math.inf, 0.01), (1.0, 0.0, 0.0)):
+        with pytest.raises(InputError):
+            filter_quality(OPTICS, *wrong)

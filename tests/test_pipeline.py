@@ -13,7 +13,7 @@ from adof_cl.device import Device
 from adof_cl.errors import InputError, TrackingError
 from adof_cl.loop import HOLE, PEG, cut_templates
 from adof_cl.optics import Mask, OpticalSystem
-from adof_cl.pipeline import Blur, CameraPipeline
+from adof_cl.pipeline import Blur, CameraPipeline, Window, WindowedPipeline
 from adof_cl.tracking import TrackingLimits
 
 Array = NDArray[np.float64]
@@ -233,3 +233,66 @@ def test_a_part_without_an_expected_place_is_refused(device: Device) -> None:
     pixels, corners = frame(2500.0, joint(2500.0))
     with pytest.raises(InputError, match="part 'hole' has no expected place"):
         pipeline(pixels, {PEG: None, HOLE: None}, {PEG: corners[PEG]})
+
+
+def test_windows_find_what_the_whole_frame_finds(device: Device) -> None:
+    depth_um = 1000.0
+    mask = joint(depth_um)
+    pixels, corners = frame(depth_um, mask)
+    window = Window((192, 192), search_shape=(84, 84), padding=64)
+    windowed = WindowedPipeline(device, OPTICS, (400, 512), {PEG: window, HOLE: window})
+    whole = taught(device, depth_um)
+    for part in (PEG, HOLE):
+        windowed.set_templates(part, whole.templates(part), ANYTHING)
+    blurs = {PEG: Blur.of(mask, OPTICS, 0.0), HOLE: Blur.of(mask, OPTICS, depth_um)}
+    found, wanted = windowed(pixels, blurs, corners), whole(pixels, blurs, corners)
+    for part in (PEG, HOLE):
+        for one, other in zip(found[part], wanted[part], strict=True):
+            # A window's end lies farther from the features than their blur reaches: rounding and its ripples.
+            np.testing.assert_allclose(one.feature_xy_px, other.feature_xy_px, atol=0.03)
+    (y, x), image = windowed.last_windows()[HOLE]
+    assert image.shape == (192, 192)
+    middle = whole.last_images()[HOLE][y : y + 192, x : x + 192][64:128, 64:128].astype(int)
+    assert np.abs(image[64:128, 64:128].astype(int) - middle).mean() < 1
+
+
+def test_a_window_is_kept_inside_the_frame_and_a_wrong_call_changes_nothing(device: Device) -> None:
+    mask = joint(1000.0)
+    pixels, corners = frame(1000.0, mask)
+    window = Window((192, 192))
+    pipeline = WindowedPipeline(device, OPTICS, (400, 512), {HOLE: window})
+    pipeline.set_templates(HOLE, taught(device, 1000.0).templates(HOLE), ANYTHING)
+    blurs = {HOLE: Blur.of(mask, OPTICS, 1000.0)}
+    first = pipeline(pixels, blurs, corners)[HOLE]
+    for wrong, sentence in (
+        ((pixels[:-1], blurs, corners), "the frame is"),
+        ((pixels, {PEG: None}, corners), "follows hole"),
+        ((pixels, blurs, {}), "no expected place"),
+        ((pixels, blurs, {HOLE: [[np.nan, 1.0]]}), "finite"),
+        ((pixels, blurs, {HOLE: corners[HOLE][:1]}), "wanted"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            pipeline(*wrong)  # type: ignore[arg-type]  # the wrong ones
+    again = pipeline(pixels, blurs, corners)[HOLE]
+    np.testing.assert_array_equal(first[0].feature_xy_px, again[0].feature_xy_px)
+    corner = np.array([[2.0, 2.0], [60.0, 60.0]])
+    pipeline(pixels, blurs, {HOLE: corner})
+    assert pipeline.last_windows()[HOLE][0] == (0, 0)
+    pipeline(pixels, blurs, {HOLE: corner + 500.0})
+    assert pipeline.last_windows()[HOLE][0] == (400 - 192, 512 - 192)
+    for made in ({}, {HOLE: Window((401, 192))}):
+        with pytest.raises(InputError):
+            WindowedPipeline(device, OPTICS, (400, 512), made)
+
+
+def test_a_filter_within_its_tolerance_stands(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline = CameraPipeline(device, OPTICS, (64, 80), (PEG,), tolerance_rad=0.5)
+    formed: list[int] = []
+    form = pipeline._restore.set_filter_table
+    monkeypatch.setattr(pipeline._restore, "set_filter_table", lambda *a: (formed.append(1), form(*a))[1])
+    pixels = np.zeros((64, 80), np.uint8)
+    for psi in (0.0, 0.4, 0.5, 0.6):
+        pipeline.restored(pixels, {PEG: Blur(20.0, psi)})
+    assert len(formed) == 2
+    with pytest.raises(InputError, match="tolerance_rad"):
+        CameraPipeline(device, OPTICS, (64, 80), (PEG,), tolerance_rad=0.0)

@@ -19,6 +19,8 @@ from adof_drivers.errors import DriverError
 
 COMMANDS: tuple[str, ...] = (
     "run",
+    "plan",
+    "tradeoff",
     "devices",
     "phase",
     "otf",

@@ -23,6 +23,7 @@ from adof_cl.errors import AdofError, InputError
 if TYPE_CHECKING:
     from adof_cl.loop import Options
     from adof_cl.record import Iteration, RunRecord
+    from adof_cl.replan import Budget
     from adof_cl.survey import ArmResult
     from adof_cl.twin import Twin
 
@@ -49,6 +50,24 @@ def run(
             help="Use the calibration.json of an earlier run of this rig (seed).",
         ),
     ] = None,
+    max_error_um: Annotated[
+        float | None,
+        typer.Option(
+            "--max-error-um", metavar="E", help="Plan each frame: no feature farther off when docking."
+        ),
+    ] = None,
+    max_ms: Annotated[
+        float | None,
+        typer.Option(
+            "--max-ms", metavar="T", help="Plan each frame: the most precise within T ms of compute."
+        ),
+    ] = None,
+    profile: Annotated[
+        Path | None,
+        typer.Option(
+            "--profile", metavar="FILE", help="For plans; default: the device's own, of adof tradeoff."
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print metrics.json at the end.")] = False,
     device: DeviceOption = None,
 ) -> None:
@@ -58,7 +77,9 @@ def run(
     server). Exits 0 when docked, 1 when the run ended otherwise, 130 on Ctrl-C; the folder is complete up to
     that moment.
 
-    Examples: adof run | adof run --seed 7 --out seven --compare | ADOF_DEVICE=cpu adof run --json
+    With a budget, mask, windows and search are planned anew for every frame: far, cheap; near, fine.
+
+    Examples: adof run | adof run --seed 7 --out seven --compare | adof run --max-error-um 2 --json
     """
     from adof_cl import twin as twins
     from adof_cl.calibration_file import load_rig, save_calibration
@@ -69,7 +90,9 @@ def run(
     from adof_cl.survey import survey
     from adof_cl.twin.parts import drawing_of
 
-    options = Options(mask=mask, rig_name=f"twin {seed}")
+    options = Options(
+        mask=mask, rig_name=f"twin {seed}", budget=_budget(max_error_um, max_ms, profile, device)
+    )
     known = None if calibration is None else load_rig(calibration, camera_ids=options.camera_ids)
     opened = Device.open(device)
     folder = _folder(out, seed)
@@ -121,6 +144,25 @@ def run(
         print(f"adof: {refusal}", file=sys.stderr)
     if not record.docked:
         raise typer.Exit(1)
+
+
+def _budget(
+    max_error_um: float | None, max_ms: float | None, profile: Path | None, device: str | None
+) -> Budget | None:
+    """Return what the loop's frames may cost, or None where nothing was asked."""
+    if max_error_um is None and max_ms is None:
+        if profile is not None:
+            raise InputError("--profile came without a budget: give --max-error-um or --max-ms with it")
+        return None
+    from adof_cl.cli.profiles import profile_for
+    from adof_cl.optics import require_positive
+    from adof_cl.planner import Planner
+    from adof_cl.replan import Budget
+
+    for name, value in (("max_error_um", max_error_um), ("max_ms", max_ms)):
+        if value is not None:
+            require_positive(**{name: value})
+    return Budget(Planner(profile_for(profile, device)), max_error_um, max_ms)
 
 
 class Truth:
