@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import threading
@@ -317,6 +318,28 @@ def test_an_axis_that_sticks_in_mid_move_is_found() -> None:
         rig.engine.motors["2"].stuck = True
         with pytest.raises(FollowingError, match="y is at"):
             rig.stage.wait_until_still()
+
+
+@pytest.mark.parametrize("velocity", [300.0, -300.0])
+def test_an_axis_that_sticks_under_renewed_velocities_is_found(velocity: float) -> None:
+    with gcs_rig() as rig:
+        rig.stage.move_to({"y": 12000.0})
+        rig.stage.wait_until_still()
+
+        def jog(periods: int) -> None:
+            for _ in range(periods):
+                rig.stage.set_velocity({"y": velocity})
+                rig.clock.wait(1 / 60)
+                rig.stage.position()
+
+        jog(240)  # four seconds: an axis that moves is never taken for a stuck one
+        rig.engine.motors["2"].stuck = True
+        axis = rig.stage.axes["y"]
+        # Half of one sum may be gone before it sticks, the next is whole; a period to see it.
+        periods = 2 + math.ceil(60 * 2 * 2 * (axis.following / abs(velocity) + axis.lag_s))
+        with pytest.raises(FollowingError, match=r"y stands .* stalled"):
+            jog(periods)
+        assert not rig.stage.latch.armed
 
 
 def test_a_second_program_does_not_get_the_device_and_does_not_disturb_the_first() -> None:

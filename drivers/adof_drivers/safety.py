@@ -174,29 +174,48 @@ class Course:
         gone = self.speed * max(time_s - self.start_s, 0.0)
         return self.target if gone >= abs(way) else self.start + math.copysign(gone, way)
 
+    def renewed_by(self, other: Course) -> bool:
+        """Whether the other begins before this one is at its end, and goes the same way."""
+        same_way = (self.target - self.start) * (other.target - other.start) > 0
+        return same_way and self.at(other.start_s) != self.target
+
 
 class MotionWatch:
     """Compares readings with commands: an axis stuck, lost or running away is found at the next reading.
 
-    At time t an axis may be anywhere its course was between t - lag and t, give or take `following`.
+    At time t an axis may be anywhere its course was between t - lag and t, give or take `following`. A course
+    that is renewed before its end, as velocities are, begins where the axis is: one by one, none tells of an
+    axis that is stuck. So their ways are added up: each time they come to twice what an axis may be behind,
+    at least half must be gone.
     """
 
     def __init__(self, axes: Mapping[str, StageAxis]) -> None:
         self._axes = axes
         self._courses: dict[str, Course] = {}
+        self._runs: dict[str, tuple[float, float]] = {}  # where it began; the way ordered by earlier courses
 
     def begin(self, courses: Mapping[str, Course]) -> None:
         """Follow these commands from now on."""
-        self._courses.update(courses)
+        for name, course in courses.items():
+            began, ordered = self._runs.get(name, (course.start, 0.0))
+            before = self._courses.get(name)
+            if before is not None and before.renewed_by(course):
+                ordered += abs(before.at(course.start_s) - before.start)
+            else:
+                began, ordered = course.start, 0.0
+            self._runs[name] = began, ordered
+            self._courses[name] = course
 
     def leave(self, names: Collection[str]) -> None:
         """Follow these axes no longer."""
         for name in names:
             self._courses.pop(name, None)
+            self._runs.pop(name, None)
 
     def forget(self) -> None:
         """Follow nothing: after a stop nobody knows how far an axis has run."""
         self._courses.clear()
+        self._runs.clear()
 
     def check(self, time_s: float, position: Mapping[str, float]) -> None:
         """Refuse readings that no command explains.
@@ -217,3 +236,13 @@ class MotionWatch:
                     f"{low:.6g} to {high:.6g} was wanted: "
                     + ("it is stalled, so look for what holds it" if stands else "check load and speed")
                 )
+            began, ordered = self._runs[name]
+            ordered += abs(soon - course.start)
+            gone = math.copysign(1.0, course.target - course.start) * (position[name] - began)
+            if ordered > 2 * (axis.following + course.speed * axis.lag_s):
+                if gone < ordered / 2:
+                    raise FollowingError(
+                        f"{name} stands at {position[name]:.6g} {axis.unit}: of {ordered:.6g} ordered it "
+                        f"went {gone:.6g}; it is stalled, so look for what holds it"
+                    )
+                self._runs[name] = position[name], -abs(soon - course.start)
