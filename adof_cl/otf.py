@@ -216,7 +216,7 @@ class Otf1d:
         return self.out
 
     def _set_few(self, pairs: list[list[float]]) -> None:
-        # What a loop does every frame: NumPy takes 20 us longer to begin than this does altogether.
+        # What a loop does every frame: NumPy takes longer to begin than this does altogether.
         place = 0
         for alpha, psi in pairs:
             if not (abs(alpha) <= ALPHA_LIMIT_RAD and abs(psi) <= PSI_LIMIT_RAD):

@@ -206,8 +206,9 @@ class Restore:
         each, and steps in the middle.
     spectrum_dtype
         What the spectrum is kept in between the steps: the precision's own type, or float16 for uint8 and
-        uint16 frames in float32. Half the memory to move, relative L2 errors below 3e-3 instead of 5e-7, and
-        at most three of 255 grey levels.
+        uint16 frames in float32. Half the memory to move, relative L2 errors below 3e-3 instead of 5e-7 and
+        at most three of 255 grey levels at an nsr of 0.01; less noise means more gain, which enlarges the
+        rounding of halves: docs/envelope.md.
     family
         "lanes" or "groups"; by default lanes on a CPU, groups elsewhere.
 
