@@ -200,6 +200,7 @@ _DIAGONALS = ((0, 2), (1, 3))
 _GATE_UM = 900.0  # the peg's tip is 300 um under its face: above this depth nothing can touch
 _LOST_LIMIT = 12
 _TURN_RAD = 0.004  # a template 20 pixels wide turned by this is off by 0.04 at its rim
+_TAUGHT_FRAMES = 4  # a template's noise is a quarter's variance: less than a frame's own
 _INSET_PX = {PEG: 12.0, HOLE: -8.0}  # templates lie on the peg's face, and on the plate around the hole
 _BENT_PX = 0.5  # a target whose two features moved apart by more was half hidden
 # The hole's middle may lie 200 um from the axis it turns about, and turn by 0.1 rad; the peg may be 80 um off
@@ -274,7 +275,7 @@ class _Eye:
         self.mask = Mask() if number == 1 else design.mask_2
         self.seen: dict[str, Features] = {}
         self.taught: dict[str, Features] = {}
-        self.pictures: dict[str, Pixels] = {}
+        self.pictures: dict[str, tuple[Pixels, Array]] = {}
         self.turned_rad: dict[str, float] = {}
         self.taught_at_rad = 0.0
 
@@ -510,16 +511,17 @@ class Assembly:
     def take_templates(self, part: str, drawings: Sequence[Drawing]) -> None:
         """Take pictures of a part's features in focus, tied to its drawing: one for each camera, 1 first."""
         self.show(self.focused(float(self.world[part][2])))
-        frames = self.look()
-        images = [frames[0].pixels]
-        for eye, frame, drawing in zip(self.eyes, frames, drawings, strict=False):
+        frames = [self.look() for _ in range(_TAUGHT_FRAMES)]
+        for eye, taken, drawing in zip(self.eyes, zip(*frames, strict=True), drawings, strict=False):
+            pictures = [frame.pixels for frame in taken]
             if eye.number == 2:
-                restored = eye.pipeline.restored(frame.pixels, {part: eye.blur(self.world[part])})
-                images.append(restored[part])
+                blur = {part: eye.blur(self.world[part])}
+                pictures = [eye.pipeline.restored(picture, blur)[part] for picture in pictures]
+            image, noise = still_picture(pictures)
             known = part in eye.seen
             expected = eye.seen[part].middle if known else eye.project(self.world[part])
             reach = 15.0 if known else 60.0 if eye.number == 1 else 30.0
-            found = register(images[-1], drawing, eye.matrix[:, :2], expected_px=expected, reach_px=reach)
+            found = register(image, drawing, eye.matrix[:, :2], expected_px=expected, reach_px=reach)
             if eye.number == 1:
                 middle = np.linalg.solve(eye.matrix[:, :2], found.origin_px - eye.origin)
                 self.world[part] = np.array([*middle, self.world[part][2]])
@@ -528,19 +530,19 @@ class Assembly:
                     aside = self.world[HOLE] - self.world[PEG]
                     self._features[part] = _DIAGONALS[int(part == HOLE and aside[0] * aside[1] > 0)]
             corners = found.pixels(self._design_of(part).corners_um[list(self._features[part])])
-            self._keep_templates(eye, part, images[-1], corners)
+            self._keep_templates(eye, part, image, noise, corners)
         self._tell("templates", f"{part}: features taken in focus")
 
     def _design_of(self, part: str) -> PartDesign:
         return self.design.peg if part == PEG else self.design.hole
 
-    def _keep_templates(self, eye: _Eye, part: str, image: Pixels, corners: Array) -> None:
+    def _keep_templates(self, eye: _Eye, part: str, image: Pixels, noise: Array, corners: Array) -> None:
         covariance = np.broadcast_to(0.01 * np.eye(2), (len(corners), 2, 2))
         eye.seen[part] = eye.taught[part] = Features(corners, covariance, [])
-        eye.pictures[part] = image
+        eye.pictures[part] = image, noise
         eye.turned_rad[part] = 0.0
         eye.taught_at_rad = self.rig.coarse.position()["theta"]
-        templates = cut_templates(image, corners, part)
+        templates = cut_templates(image, corners, part, noise=noise, optics=eye.optics)
         eye.set_templates(part, templates, TrackingLimits(mismatch=0.7))
         eye.extent_px[part] = extent_px(templates, corners)
 
@@ -556,7 +558,9 @@ class Assembly:
             block = eye.matrix[:, :2]
             seen = block @ np.array([[c, -s], [s, c]]) @ np.linalg.inv(block)
             corners = eye.taught[HOLE].xy_px
-            eye.set_templates(HOLE, cut_templates(eye.pictures[HOLE], corners, HOLE, seen))
+            picture, noise = eye.pictures[HOLE]
+            templates = cut_templates(picture, corners, HOLE, seen, noise=noise, optics=eye.optics)
+            eye.set_templates(HOLE, templates)
 
     def _window(self, centre_xy: Array, half: int) -> tuple[slice, slice]:
         rows, columns = self.design.region_rows, self.design.region_columns
@@ -1074,6 +1078,28 @@ class _Sight:
     ssd_peg: float
 
 
+def still_picture(pictures: Sequence[Pixels]) -> tuple[Pixels, Array]:
+    """Return the mean of pictures of what stands still, and the standard deviation of its noise.
+
+    A template's own noise moves every place that it finds alike, and noise in its slopes passes for texture.
+
+    Returns
+    -------
+    picture : (rows, columns) uint8
+    noise : (rows, columns)
+    """
+    values = np.stack(pictures).astype(np.float64)
+    noise = values.std(axis=0, ddof=1) / math.sqrt(len(pictures))
+    return np.rint(values.mean(axis=0)).astype(np.uint8), noise
+
+
+def _noise_at(noise: Array | None, centre_xy: Array, shape: tuple[int, int]) -> float | None:
+    if noise is None:
+        return None
+    x, y = (max(0, int(v)) for v in np.rint(centre_xy - np.array(shape[::-1]) / 2))
+    return math.sqrt(float(np.mean(noise[y : y + shape[0], x : x + shape[1]] ** 2)))
+
+
 def cut_templates(
     image: Pixels,
     corners: Array,
@@ -1081,6 +1107,8 @@ def cut_templates(
     seen_turn: Array | None = None,
     *,
     shape: tuple[int, int] = (20, 20),
+    noise: Array | None = None,
+    optics: OpticalSystem | None = None,
 ) -> list[Template]:
     """Cut the templates of a part's features where nothing but the part is, each anchored at its corner.
 
@@ -1094,19 +1122,22 @@ def cut_templates(
         The pictures are turned by this about their corners first: how the camera sees the part turned.
     shape
         Rows and columns of each template.
+    noise : (rows, columns), optional
+        Standard deviation of the picture's noise; without it, estimated.
+    optics
+        The camera's, so that each template states what sampling does to its place.
     """
     templates = []
     middle = corners.mean(axis=0)
     for corner in corners:
         centre = corner + _INSET_PX[part] * np.sign(middle - corner)
-        template = Template.cut(image, centre, shape)
+        template = Template.cut(image, centre, shape, noise=_noise_at(noise, centre, shape), optics=optics)
         anchor = template.anchor_yx + (corner - centre)[::-1]
         if seen_turn is not None:
             offset = seen_turn @ (centre - corner)
             warp = np.column_stack([seen_turn, corner - seen_turn @ corner])
             turned = cv2.warpAffine(image, warp, image.shape[::-1], flags=cv2.INTER_CUBIC)
-            noise = template.noise
-            template = Template.cut(turned, corner + offset, shape, noise=noise)
+            template = Template.cut(turned, corner + offset, shape, noise=template.noise, optics=optics)
             anchor = template.anchor_yx - offset[::-1]
         templates.append(template.anchored(anchor))
     return templates

@@ -147,7 +147,8 @@ class Specimen:
             self._pictures[part, camera] = taken
         taken = self._pictures[part, camera]
         shape = (side_px, side_px)
-        return cut_templates(taken.pixels, taken.corners_px[part], part, shape=shape)[:features]
+        corners = taken.corners_px[part]
+        return cut_templates(taken.pixels, corners, part, shape=shape, optics=self.optics)[:features]
 
     def depth_seen_um(self, first: Array, second: Array) -> float:
         """Return the depth of a place seen at `first` by camera 1 and at `second` by camera 2, (x, y)."""

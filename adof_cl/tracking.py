@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 from scipy import ndimage, special
+from scipy.fft import next_fast_len
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError, TrackingError
-from adof_cl.optics import require_finite, require_positive
+from adof_cl.optics import OpticalSystem, require_finite, require_positive
 from adof_cl.ssd_search import SsdSearch
 
 Array = NDArray[np.float64]
@@ -26,7 +27,6 @@ _CONTEXT = 8  # pixels around a patch: a spline's memory of its end fades as 0.2
 # What each step of the ladder leaves of its own, px^2: whole pixels spread evenly, the quadratic's pull.
 _LEFT_PX2 = {"integer": 1 / 12, "quadratic": 0.03**2, "gauss_newton": 0.0}
 _REACH_PX = 1.5  # a refinement that goes farther has left the match it started from
-_POLE = math.sqrt(3) - 2  # of the cubic spline's prefilter
 # White noise of variance 1 has a spline derivative of this variance: 9 (2/sqrt(3) - 1), eq. S11.
 _DERIVATIVE_NOISE = 9 * (2 / math.sqrt(3) - 1)
 
@@ -109,6 +109,8 @@ class Template:
         Standard deviation of the image noise, grey levels.
     hessian_yx : (2, 2)
         sum grad grad^T once gain and offset have taken their share and noise its own (eq. S11).
+    sampling_yx : (2, 2)
+        What of the place depends on where the pixels fell when this picture was taken, px^2 (eq. S16).
     """
 
     pixels: NDArray[Any]
@@ -116,6 +118,7 @@ class Template:
     gradient_yx: Array
     noise: float
     hessian_yx: Array
+    sampling_yx: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
     @property
     def sigma_px(self) -> float:
@@ -131,6 +134,7 @@ class Template:
         *,
         noise: float | None = None,
         sigma_limit_px: float = 0.1,
+        optics: OpticalSystem | None = None,
     ) -> Template:
         """Cut a template around a feature of an image taken in focus.
 
@@ -146,6 +150,9 @@ class Template:
             fine texture counts as noise.
         sigma_limit_px
             The template is refused when it cannot place a feature better than this along every direction.
+        optics
+            The camera's: how much detail finer than its pixels the picture holds. None: none, so that what
+            sampling does to a place is not stated.
 
         Raises
         ------
@@ -156,7 +163,7 @@ class Template:
 
         Source
         ------
-        docs/maths.md, eqs. S10 and S11; the paper's section 3.3 (templates are taken in focus).
+        docs/maths.md, eqs. S10, S11 and S16; the paper's section 3.3 (templates are taken in focus).
         """
         feature_yx = np.asarray(feature_xy_px, dtype=np.float64)[::-1]
         if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16, np.float32):
@@ -201,7 +208,11 @@ class Template:
             hessian_yx=_texture(gradient, pixels.astype(np.float64), noise),
         )
         template._require_texture(sigma_limit_px)
-        return template
+        if optics is None:
+            return template
+        grid = _grid(template.pixels.shape)
+        detail = _power(pixels.astype(np.float64) - pixels.mean(), grid) * _folded(optics, grid)
+        return replace(template, sampling_yx=_symmetric(_place_response(template) @ detail.ravel()))
 
     def _require_texture(self, sigma_limit_px: float) -> None:
         weakest, axes = np.linalg.eigh(self.hessian_yx)
@@ -261,15 +272,82 @@ def _spline_slope(values: Array, axis: int) -> Array:
 
 
 def _texture(gradient_yx: Array, pixels: Array, noise: float) -> Array:
-    slopes = gradient_yx.reshape(2, -1)
-    nuisance, _ = np.linalg.qr(_gain_and_offset(pixels))
-    slopes = slopes - (slopes @ nuisance) @ nuisance.T
+    slopes = _beside_gain_and_offset(gradient_yx.reshape(2, -1), pixels)
     return np.asarray(slopes @ slopes.T - pixels.size * _DERIVATIVE_NOISE * noise**2 * np.eye(2))
+
+
+def _beside_gain_and_offset(slopes: Array, pixels: Array) -> Array:
+    nuisance, _ = np.linalg.qr(_gain_and_offset(pixels))
+    return np.asarray(slopes - (slopes @ nuisance) @ nuisance.T)
 
 
 def _gain_and_offset(pixels: Array) -> Array:
     flat = pixels.ravel()
     return np.stack([flat - flat.mean(), np.ones_like(flat)], axis=1)
+
+
+def _grid(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return a grid on which a patch's autocovariance does not wrap."""
+    rows, columns = (int(next_fast_len(2 * n - 1, real=True)) for n in shape)
+    return rows, columns
+
+
+def _power(values: Array, size: tuple[int, int]) -> Array:
+    """Return the periodogram of patches (..., rows, columns), whose mean over a whole grid is their power."""
+    spectrum = np.fft.rfft2(values, size)
+    return np.asarray((spectrum.real**2 + spectrum.imag**2) / (values.shape[-2] * values.shape[-1]))
+
+
+def _whole(size: tuple[int, int]) -> Array:
+    """Return how many frequencies of the whole grid each column of the half spectrum stands for."""
+    twice = np.full(size[1] // 2 + 1, 2.0)
+    twice[0] = 1.0
+    if size[1] % 2 == 0:
+        twice[-1] = 1.0
+    return twice
+
+
+def _place_response(template: Template) -> Array:
+    """Return what noise of unit power at each frequency does to the place: yy, yx and xx, px^2 (eq. S10)."""
+    pixels = template.pixels.astype(np.float64)
+    size = _grid(pixels.shape)
+    slopes = _beside_gain_and_offset(template.gradient_yx.reshape(2, -1), pixels)
+    weights = np.linalg.solve(template.hessian_yx, slopes).reshape(2, *pixels.shape)
+    y, x = np.fft.rfft2(weights, size) / math.sqrt(math.prod(size))
+    response = np.stack([np.abs(y) ** 2, (y.conj() * x).real, np.abs(x) ** 2]) * _whole(size)
+    return np.asarray(response.reshape(3, -1))
+
+
+def _left_by_fit(model: Array, shape: tuple[int, int]) -> Array:
+    """Return the share of white noise's power at each frequency that a fit of `model` leaves."""
+    fitted, _ = np.linalg.qr(model)
+    return np.asarray(1 - _power(fitted.T.reshape(-1, *shape), _grid(shape)).sum(axis=0))
+
+
+def _symmetric(entries: Array) -> Array:
+    """Return (..., 2, 2) of (..., 3): yy, yx, xx."""
+    return np.asarray(entries[..., [[0, 1], [1, 2]]])
+
+
+def _folded(optics: OpticalSystem, size: tuple[int, int]) -> Array:
+    """Return, at each frequency, the power of finer detail that pixels fold there over its own (eq. S16).
+
+    In focus, for a scene of edges, whose spectrum falls as 1/f.
+    """
+
+    def passed(cycles_a_pixel: Array) -> Array:
+        u = optics.normalised_frequency(1 / optics.object_pitch_um) * cycles_a_pixel
+        return np.asarray(np.maximum(1 - u / 2, 0) * np.abs(np.sinc(cycles_a_pixel)))
+
+    def along(frequency: Array) -> Array:
+        own = passed(frequency)
+        seen = (frequency > 0) & (own > 0)
+        ratio = passed(1 - frequency) * frequency / (1 - frequency)
+        return np.asarray(np.divide(ratio, own, out=np.zeros_like(own), where=seen) ** 2)
+
+    rows = along(np.asarray(np.abs(np.fft.fftfreq(size[0])), dtype=np.float64))
+    columns = along(np.asarray(np.fft.rfftfreq(size[1]), dtype=np.float64))
+    return np.asarray(rows[:, None] + columns)
 
 
 def quadratic_minimum(neighbourhood: Array) -> Array:
@@ -333,7 +411,9 @@ class GaussNewton:
         taps = self.shape[0] * self.shape[1]
         self._model = np.empty((count, taps, 4))
         self._solve = np.empty((count, 4, taps))
-        self._inverse_hessian = np.empty((count, 2, 2))
+        self._grid = _grid(self.shape)
+        self._response = np.empty((count, 3, self._grid[0] * (self._grid[1] // 2 + 1)))
+        self._sampling = np.empty((count, 2, 2))
         self._means = np.empty(count)
         for index, template in enumerate(templates):
             self.replace(index, template)
@@ -346,7 +426,12 @@ class GaussNewton:
         normal = model.T @ model
         self._model[index] = model
         self._solve[index] = np.linalg.solve(normal, model.T)
-        self._inverse_hessian[index] = np.linalg.inv(template.hessian_yx)
+        response = _place_response(template)
+        # What the fit took from the residual it took where it is sensitive: this much more was there.
+        left = _left_by_fit(model, self.shape).ravel()
+        along = response[0] + response[2]
+        self._response[index] = response * float(along.sum() / (along @ left))
+        self._sampling[index] = 2 * template.sampling_yx  # the template's own, and the frame's
         self._means[index] = values.mean()
 
     def __call__(self, patches: NDArray[Any], start_yx: Array, iterations: int = 20) -> Refinement:
@@ -371,17 +456,14 @@ class GaussNewton:
         gain, offset = fit[:, 2], fit[:, 3] - fit[:, 2] * self._means
         # What the slopes fit is the last step's rest and its noise; gain and offset alone explain the image.
         unexplained = image - (self._model @ fit[:, :, None])[:, :, 0]
-        taps = image.shape[1]
-        variance = (unexplained**2).sum(axis=1) / max(taps - 4, 1)
-        kept = np.prod(_interpolated_noise(shift), axis=1)
-        noise2 = variance / (kept + gain**2)
-        scale = noise2 * (1 + gain**2) / np.maximum(gain**2, 1e-12)
+        power = _power(unexplained.reshape(-1, *self.shape), self._grid).reshape(len(shift), -1, 1)
+        spread = _symmetric((self._response @ power)[:, :, 0]) / np.maximum(gain**2, 1e-12)[:, None, None]
         plain = image - (self._model[:, :, 2:] @ fit[:, 2:, None])[:, :, 0]
-        spread = ((image - image.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
-        mismatch = np.where(spread > 0, (plain**2).sum(axis=1) / np.where(spread > 0, spread, 1), 1.0)
+        varied = ((image - image.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
+        mismatch = np.where(varied > 0, (plain**2).sum(axis=1) / np.where(varied > 0, varied, 1), 1.0)
         return Refinement(
             shift_yx=shift,
-            covariance_yx=scale[:, None, None] * self._inverse_hessian,
+            covariance_yx=spread + self._sampling,
             gain=gain,
             offset=offset,
             mismatch=np.where(gain > 0, np.minimum(mismatch, 1.0), 1.0),
@@ -422,16 +504,6 @@ def _spline_rows(weights: Array, rises: NDArray[np.int64], n: int) -> Array:
     return np.lib.stride_tricks.as_strided(
         line[:, n:], (count, n, width), (line.strides[0], -step, step), writeable=False
     )
-
-
-def _interpolated_noise(shift: Array) -> Array:
-    """Return how much of white noise's variance spline interpolation keeps at `shift`; 1 at whole pixels."""
-    weights = _spline_weights(shift - np.floor(shift))
-    lag = np.abs(np.subtract.outer(np.arange(4), np.arange(4)))
-    # Autocorrelation of the prefilter's impulse response h_k = sqrt(3) z^|k|.
-    z2 = _POLE * _POLE
-    response = 3 * np.power(_POLE, lag) * ((1 + z2) / (1 - z2) + lag)
-    return np.asarray(np.einsum("...i,ij,...j->...", weights, response, weights))
 
 
 class TemplateTracker:
