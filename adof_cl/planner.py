@@ -20,6 +20,7 @@ from adof_cl.mask import filter_quality
 from adof_cl.optics import Mask, OpticalSystem, require_positive
 from adof_cl.pipeline import SAME_RAD, Window
 from adof_cl.profile import (
+    REFERENCE,
     REFINES,
     RESTORATIONS,
     SEARCHES,
@@ -195,13 +196,11 @@ def _place(grid: Array, value: float) -> tuple[int, float]:
 class _Times:
     """Times of chains: a restoration in a window plus a search, each as measured."""
 
-    def __init__(self, profile: DeviceProfile) -> None:
-        self.shared_s = profile.shared_s
-        measured = {(t.chain, t.features): t.time_s.median for t in profile.times}
-        base = Chain("float32", 160, "quadratic", TEMPLATE_PX, SEARCHES[0])
-        if (base, 1) not in measured:
-            raise InputError("the profile holds no times to plan with: measure it anew with adof tradeoff")
-        self._base = measured[base, 1]
+    def __init__(self, profile: DeviceProfile, pace: float) -> None:
+        self.shared_s = pace * profile.shared_s
+        measured = {(t.chain, t.features): pace * t.time_s.median for t in profile.times}
+        base = REFERENCE
+        self._base = pace * profile.reference_s
         self._restore = {
             (c.restoration, c.window_px): seconds
             for (c, features), seconds in measured.items()
@@ -213,7 +212,7 @@ class _Times:
             if c.restoration == base.restoration and c.window_px == base.window_px
         }
         self._known: dict[tuple[Chain, int], float] = {}
-        self._form = {(f.restoration, f.window_px): f.time_s.median for f in profile.forms}
+        self._form = {(f.restoration, f.window_px): pace * f.time_s.median for f in profile.forms}
 
     def knows(self, restoration: str) -> bool:
         return (restoration, WINDOWS[0]) in self._restore
@@ -260,16 +259,25 @@ class Planner:
     Built once from the profile; `plan` only computes: about a millisecond for two objects, nothing on the
     device.
 
+    Parameters
+    ----------
+    profile
+        The device's.
+    pace
+        How many times as long everything takes now (`adof_cl.pace.pace`).
+
     Raises
     ------
     InputError
-        The profile lacks what plans are made of.
+        The profile lacks what plans are made of; a pace that is not positive.
     """
 
-    def __init__(self, profile: DeviceProfile) -> None:
+    def __init__(self, profile: DeviceProfile, pace: float = 1.0) -> None:
+        require_positive(pace=pace)
         self.profile = profile
+        self.pace = pace
         self._errors = _Errors(profile)
-        self._times = _Times(profile)
+        self._times = _Times(profile, pace)
 
     def plan(
         self,

@@ -108,6 +108,10 @@ class Chain:
         return f"{self.restoration}, {where}, {self.refine}, {self.template_px} px in {self.search_px}"
 
 
+REFERENCE = Chain("float32", 160, "quadratic", TEMPLATE_PX, SEARCHES[0])
+"""One object, one feature: other chains' times are this one's and what they add; paces are taken from it."""
+
+
 @dataclass(frozen=True)
 class ChainTime:
     """Time of one object's chain for so many features."""
@@ -229,6 +233,20 @@ class DeviceProfile:
                 f"no profile of {facts['name']} is kept here: run adof tradeoff once, or give --profile FILE"
             )
         return cls.read(path)
+
+    @property
+    def reference_s(self) -> float:
+        """Time of `REFERENCE` for one feature.
+
+        Raises
+        ------
+        InputError
+            It was not measured.
+        """
+        for timed in self.times:
+            if timed.chain == REFERENCE and timed.features == 1:
+                return timed.time_s.median
+        raise InputError("the profile holds no times to plan with: measure it anew with adof tradeoff")
 
     def fits(self, facts: dict[str, Any]) -> bool:
         """Whether it was measured on the device of these facts, with the same driver."""

@@ -32,6 +32,7 @@ from adof_cl.otf import Otf1d, SeparableMaskOtf, stationary_phase_otf
 from adof_cl.otf_table import OtfTable
 from adof_cl.pipeline import Blur, CameraPipeline, WindowedPipeline
 from adof_cl.profile import (
+    REFERENCE,
     REFINES,
     RESTORATIONS,
     SCHEMA,
@@ -773,7 +774,7 @@ def chain_times(
     Restorations are timed in every window with one search, and searches in one window: their costs add.
     """
     restorations = [r for r in RESTORATIONS if r != "float64" or sweep.device.facts.fp64]
-    base = Chain("float32", 160, "quadratic", TEMPLATE_PX, 32)
+    base = REFERENCE
     chains = [
         (Chain(r, w, base.refine, base.template_px, base.search_px), 1)
         for r, w in product(restorations, WINDOWS)
@@ -981,14 +982,15 @@ def measure(
 def pareto(readings: Sequence[Reading]) -> list[Reading]:
     """Return the readings that no other beats in both time and error, quickest first.
 
-    Times of whole chains and of a knob's own part are not compared with each other.
+    Errors within a tenth of each other count as one: a dozen specimens do not tell them apart. Times of whole
+    chains and of a knob's own part are not compared with each other.
     """
     fronts: list[Reading] = []
     for whole in (False, True):
         least = math.inf
         mine = [r for r in readings if r.whole_chain == whole]
         for reading in sorted(mine, key=lambda r: (r.time_s.median, r.worst_um)):
-            if reading.worst_um < least:
+            if reading.worst_um < least / _ALIKE:
                 least = reading.worst_um
                 fronts.append(reading)
     return fronts

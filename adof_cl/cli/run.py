@@ -154,15 +154,14 @@ def _budget(
         if profile is not None:
             raise InputError("--profile came without a budget: give --max-error-um or --max-ms with it")
         return None
-    from adof_cl.cli.profiles import profile_for
+    from adof_cl.cli.profiles import planner_for
     from adof_cl.optics import require_positive
-    from adof_cl.planner import Planner
     from adof_cl.replan import Budget
 
     for name, value in (("max_error_um", max_error_um), ("max_ms", max_ms)):
         if value is not None:
             require_positive(**{name: value})
-    return Budget(Planner(profile_for(profile, device)), max_error_um, max_ms)
+    return Budget(planner_for(profile, device), max_error_um, max_ms)
 
 
 class Truth:
