@@ -20,7 +20,7 @@ from adof_cl.pipeline import Window
 from adof_cl.program import CACHE_VARIABLE
 from adof_cl.turns import Spread
 
-SCHEMA = 1
+SCHEMA = 2
 _INFINITE = pydantic.ConfigDict(ser_json_inf_nan="constants")  # a lost feature's error: written, not null
 _IDENTITY = ("name", "platform", "driver_version")
 
@@ -129,10 +129,8 @@ class ChainError:
     ----------
     alpha_rad, share
         The mask, and |psi|/(3 alpha); without a mask `share` is |psi| itself.
-    bias_px
-        Without noise: the farthest that any object's worst feature was off.
-    noise_px
-        What noise of `DeviceProfile.noise_grey` adds, in quadrature.
+    errors_px
+        The farthest that any object's worst feature was off, at each of `DeviceProfile.noises_grey`.
     """
 
     __pydantic_config__: ClassVar = _INFINITE
@@ -141,8 +139,7 @@ class ChainError:
     template_px: int
     alpha_rad: float
     share: float
-    bias_px: float
-    noise_px: float
+    errors_px: list[float]
 
 
 @dataclass(frozen=True)
@@ -170,8 +167,12 @@ class DeviceProfile:
         What a second object in the same frame does not pay again.
     mask_s
         Time to compute a mask's panel codes.
-    noise_grey, nsr
-        Noise of the frames on which `errors` were measured, and of the filters.
+    noises_grey, nsr
+        Noises of the frames on which `errors` were measured, the least first; and of the filters.
+    blur_px
+        lambda N over the object's pixel pitch, of the optics on which they were measured.
+    shape
+        Of the whole frame, (rows, columns).
     """
 
     schema_version: int
@@ -180,8 +181,10 @@ class DeviceProfile:
     device: dict[str, Any]
     machine: dict[str, Any]
     settings: dict[str, Any]
-    noise_grey: float
+    noises_grey: list[float]
     nsr: float
+    blur_px: float
+    shape: tuple[int, int]
     readings: list[Reading]
     times: list[ChainTime]
     forms: list[FormTime]

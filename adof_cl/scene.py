@@ -102,6 +102,12 @@ class Scene:
         require_positive(frame_rate_hz=self.frame_rate_hz, noise_grey=self.noise_grey)
         if min(self.shape) < 96:
             raise InputError(f"shape is {self.shape}: at least 96 pixels a side were wanted")
+        for thing in self.objects:
+            if thing.extent_px > max(self.shape):
+                raise InputError(
+                    f"extent_px of '{thing.name}' is {thing.extent_px:g}: the frame has {self.shape[1]} x "
+                    f"{self.shape[0]} pixels, so follow features that lie closer together"
+                )
         if not 1 <= self.tilt_deg <= 90:
             raise InputError(f"tilt_deg is {self.tilt_deg}: 1 to 90 was wanted")
 
