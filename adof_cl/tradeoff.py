@@ -880,7 +880,9 @@ def chain_errors(
                     off.setdefault((key, noise), []).append(off_px(found, exposure.corners_px[part]))
         for key in pipelines:
             if key[0] in kinds:
-                worst = [max(off[key, noise]) for noise in NOISES]
+                # Whole pixels may be off by half of one along both axes, whatever a few frames say.
+                least = math.sqrt(0.5) if key[1] == "integer" else 0.0
+                worst = [max(least, *off[key, noise]) for noise in NOISES]
                 errors.append(ChainError(*key, alpha, share, worst))
                 if key[0] == "float32":
                     errors.append(ChainError("float64", *key[1:], alpha, share, worst))
