@@ -16,6 +16,7 @@ import platformdirs
 import pydantic
 
 from adof_cl.errors import InputError
+from adof_cl.files import read_versioned
 from adof_cl.pipeline import Window
 from adof_cl.program import CACHE_VARIABLE
 from adof_cl.turns import Spread
@@ -205,21 +206,7 @@ class DeviceProfile:
         InputError
             It cannot be read, or is not one of this version's.
         """
-        try:
-            profile = _PROFILE.validate_json(path.read_bytes())
-        except OSError as failure:
-            raise InputError(
-                f"{path} cannot be read ({failure.strerror}): write one with adof tradeoff --json FILE"
-            ) from failure
-        except pydantic.ValidationError as failure:
-            raise InputError(
-                f"{path} is not a device profile: give a file that adof tradeoff --json wrote"
-            ) from failure
-        if profile.schema_version != SCHEMA:
-            raise InputError(
-                f"{path} has schema version {profile.schema_version}, {SCHEMA} was wanted: measure it anew"
-            )
-        return profile
+        return read_versioned(path, _PROFILE, SCHEMA, "a device profile", "adof tradeoff --json FILE")
 
     @classmethod
     def of_device(cls, facts: dict[str, Any]) -> DeviceProfile:
@@ -259,7 +246,7 @@ class DeviceProfile:
 def kept_at(facts: dict[str, Any]) -> Path:
     """Return where the profile of a device with this driver is kept: beside its compiled kernels."""
     folder = Path(os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_path("adof-cl"))
-    identity = "\n".join(str(facts[key]) for key in _IDENTITY)
+    identity = "\n".join([str(SCHEMA), *(str(facts[key]) for key in _IDENTITY)])
     return folder / f"profile-{hashlib.sha256(identity.encode()).hexdigest()[:16]}.json"
 
 
