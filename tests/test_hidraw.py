@@ -1,58 +1,252 @@
-"""The real hidapi on an emulated device node: the kernel's hidraw interface, answered by umockdev."""
+"""The real hidapi on emulated device nodes: the kernel's hidraw interface, answered by umockdev."""
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
-from pathlib import Path
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import pytest
 
-SYSTEM_PYTHON = "/usr/bin/python3"
-CHILD = """
-import time
+from adof_drivers.emulators.hid_nodes import command
+from adof_drivers.errors import DriverError
+
+PROGRAM = """
+import subprocess, sys, time
+from adof_drivers.errors import DriverError
+from adof_drivers.pedal import StopPedal
+from adof_drivers.relay import HidRelay
 from adof_drivers.spacemouse import SpaceMouse
 
-mouse = SpaceMouse.open()
-print("opened", flush=True)
+REST = (0.0,) * 6
 
-def wait_until(wanted):
+def until(device, wanted):
     ends_s = time.monotonic() + 10
-    while not wanted(state := mouse.poll()) and time.monotonic() < ends_s:
-        pass
+    while not wanted(state := device.poll()):
+        assert time.monotonic() < ends_s, state
     return state
 
-# The report of rest arms it; the pushed one comes after this line.
-ends_s = time.monotonic() + 0.25
-while time.monotonic() < ends_s:
-    mouse.poll()
-print("rest", mouse.poll().axes, flush=True)
-print("pushed", wait_until(lambda state: any(state.axes)).axes, flush=True)
-last = wait_until(lambda state: not state.connected)
-print("unplugged", last.axes, last.connected, flush=True)
+def for_(duration_s, device, wanted):
+    ends_s = time.monotonic() + duration_s
+    while time.monotonic() < ends_s:
+        assert wanted(state := device.poll()), state
+
+def plugged_in_again(open_):
+    ends_s = time.monotonic() + 10
+    while True:
+        try:
+            return open_()
+        except DriverError:
+            assert time.monotonic() < ends_s
+
+def failure_of(ask):
+    ends_s = time.monotonic() + 10
+    while True:
+        try:
+            ask()
+        except DriverError as failure:
+            return str(failure)
+        assert time.monotonic() < ends_s
+
+def refusal(ask):
+    try:
+        ask()
+    except DriverError as failure:
+        return str(failure)
+    raise AssertionError("it was not refused")
+
+def say(*words):
+    print(*words, flush=True)
 """
 
 
-def umockdev_is_there() -> bool:
-    if shutil.which("umockdev-wrapper") is None or not Path(SYSTEM_PYTHON).exists():
+def installed() -> bool:
+    try:
+        command(["relay"], ["true"])
+    except DriverError:
         return False
-    asked = "import gi; gi.require_version('UMockdev', '1.0'); from gi.repository import UMockdev"
-    return subprocess.run([SYSTEM_PYTHON, "-c", asked], capture_output=True).returncode == 0
+    return True
 
 
-@pytest.mark.skipif(not umockdev_is_there(), reason="umockdev with its Python bindings is not installed")
-def test_a_spacemouse_on_a_device_node_is_found_read_and_missed_when_unplugged() -> None:
-    script = Path(__file__).with_name("umockdev_spacemouse.py")
-    done = subprocess.run(
-        ["umockdev-wrapper", SYSTEM_PYTHON, str(script), sys.executable, CHILD],
+pytestmark = pytest.mark.skipif(not installed(), reason="umockdev with its Python bindings is not installed")
+
+
+class Session:
+    """A program among devices: what it says, and what is done to them."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    def says(self, line: str) -> None:
+        assert self._process.stdout is not None
+        came = self._process.stdout.readline().rstrip("\n")
+        if came != line:
+            raise AssertionError(f"{came!r} came, {line!r} was wanted\n{self._process.communicate()[1]}")
+
+    def do(self, *lines: str) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write("".join(f"{line}\n" for line in lines))
+        self._process.stdin.flush()
+
+    def ends(self) -> list[str]:
+        """What the devices noticed, line by line."""
+        _, said = self._process.communicate(timeout=60)
+        assert self._process.returncode == 0, said
+        return said.splitlines()
+
+
+@contextmanager
+def session(kinds: list[str], code: str) -> Iterator[Session]:
+    with subprocess.Popen(
+        command(kinds, [sys.executable, "-c", PROGRAM + code]),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            yield Session(process)
+        finally:
+            process.kill()
+
+
+def test_a_spacemouse_unplugged_while_deflected_rests_and_moves_nothing_when_it_is_back() -> None:
+    code = """
+mouse = SpaceMouse.open()
+for_(0.25, mouse, lambda state: state.axes == REST)
+say("rest")
+say("pushed", until(mouse, lambda state: state.axes[0]).axes)
+gone = until(mouse, lambda state: not state.connected)
+say("unplugged", gone.axes == REST)
+say(refusal(SpaceMouse.open).partition(" (")[0])
+again = plugged_in_again(SpaceMouse.open)
+for_(0.3, again, lambda state: state.axes == REST and state.connected)
+for_(0.01, mouse, lambda state: state.axes == REST and not state.connected)
+say("plugged in while pushed, and at rest")
+say("pushed", until(again, lambda state: state.axes[0]).axes)
+again.set_light(on=True)
+again.close()
+"""
+    with session(["spacemouse"], code) as devices:
+        devices.says("rest")
+        devices.do("spacemouse deflect 350 -350 0")
+        devices.says("pushed (1.0, -1.0, 0.0, 0.0, 0.0, 0.0)")
+        devices.do("spacemouse unplug")
+        devices.says("unplugged True")
+        devices.says("no SpaceMouse is connected")
+        devices.do("spacemouse plug", "spacemouse deflect 350 350 350 350 350 350")
+        devices.says("plugged in while pushed, and at rest")
+        devices.do("spacemouse deflect 0 0 0", "wait 0.1", "spacemouse deflect 350 0 0")
+        devices.says("pushed (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)")
+        assert devices.ends() == [
+            "spacemouse: plugged in at /dev/hidraw0",
+            "spacemouse: unplugged",
+            "spacemouse: plugged in at /dev/hidraw1",
+            "spacemouse: light on",
+        ]
+
+
+@pytest.mark.parametrize(("kind", "form"), [("pedal", "joystick"), ("keyboard-pedal", "keyboard")])
+def test_a_pedal_stops_when_pressed_and_when_unplugged_until_it_is_opened_again(kind: str, form: str) -> None:
+    code = f"""
+pedal = StopPedal.open(form={form!r})
+for_(0.05, pedal, lambda state: not state.stop)
+say("free")
+until(pedal, lambda state: state.stop)
+say("stop")
+say("free again", until(pedal, lambda state: not state.stop).tested)
+say("gone", until(pedal, lambda state: not state.connected).stop)
+again = plugged_in_again(lambda: StopPedal.open(form={form!r}))
+for_(0.05, pedal, lambda state: state.stop and not state.connected)
+state = again.poll()
+say("opened again", state.stop, state.tested)
+again.close()
+"""
+    with session([kind], code) as devices:
+        devices.says("free")
+        devices.do(f"{kind} press")
+        devices.says("stop")
+        devices.do(f"{kind} release")
+        devices.says("free again True")
+        devices.do(f"{kind} unplug")
+        devices.says("gone True")
+        devices.do(f"{kind} plug")
+        devices.says("opened again False False")
+        devices.ends()
+
+
+def test_a_relay_that_sticks_or_goes_is_told_and_is_off_when_plugged_in_again() -> None:
+    code = """
+relay = HidRelay.open()
+relay.switch(1, on=True)
+say(relay.channels, relay.state())
+
+def switch():
+    relay.switch(0, on=True)
+    relay.switch(0, on=False)
+
+say(failure_of(switch)[:22])
+say(failure_of(relay.state).partition(" (")[0])
+relay.close()
+again = plugged_in_again(HidRelay.open)
+say(again.state())
+again.switch(1, on=True)
+again.close()
+"""
+    with session(["relay"], code) as devices:
+        devices.says("2 (False, True)")
+        devices.do("relay stick 0 1")
+        devices.says("relay 0 did not switch")
+        devices.do("relay unplug")
+        devices.says("the USB relay was unplugged")
+        devices.do("relay plug")
+        devices.says("(False, False)")
+        noticed = devices.ends()
+        assert noticed[-2:] == ["relay: on 1", "relay: all off"]  # closed: off
+
+
+def test_another_device_on_a_port_is_named_and_nothing_is_sent_to_it() -> None:
+    code = """
+say(refusal(lambda: HidRelay.open("/dev/hidraw0")))
+say(refusal(lambda: SpaceMouse.open("/dev/hidraw1")).partition(" (")[0])
+say(refusal(lambda: StopPedal.open("/dev/hidraw2")).partition(" (")[0])
+say(refusal(lambda: StopPedal.open("/dev/hidraw7")).partition(" (")[0])
+"""
+    with session(["spacemouse", "pedal", "relay"], code) as devices:
+        devices.says(
+            "at /dev/hidraw0 is 256f:c635 'SpaceMouse Compact', no USB relay (16c0:05df): name another path"
+        )
+        devices.says("at /dev/hidraw1 is 05f3:00ff 'VEC Footpedal', no SpaceMouse")
+        devices.says("at /dev/hidraw2 is 16c0:05df 'USBRelay2', no foot pedal")
+        devices.says("/dev/hidraw7 cannot be opened")
+        assert all("plugged in" in line for line in devices.ends())
+
+
+def test_a_second_program_is_refused_and_the_first_goes_on() -> None:
+    code = """
+relay, mouse = HidRelay.open(), SpaceMouse.open()
+relay.switch(0, on=True)
+other = "from adof_drivers.KIND import CLASS; CLASS.open()"
+for kind, name in (("relay", "HidRelay"), ("spacemouse", "SpaceMouse")):
+    ran = subprocess.run(
+        [sys.executable, "-c", other.replace("KIND", kind).replace("CLASS", name)],
         capture_output=True,
         text=True,
-        timeout=60,
     )
-    assert done.stdout.splitlines() == [
-        "opened",
-        "rest (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)",
-        "pushed (1.0, -1.0, 0.0, 0.0, 0.0, 0.0)",
-        "unplugged (0.0, 0.0, 0.0, 0.0, 0.0, 0.0) False",
-    ], done.stderr
+    say(ran.stderr.splitlines()[-1].partition(": ")[2])
+say(relay.state())
+for_(0.25, mouse, lambda state: state.connected)
+say("first")
+until(mouse, lambda state: state.axes[0] == 1)
+for device in (relay, mouse):
+    device.close()
+HidRelay.open().close()
+"""
+    with session(["relay", "spacemouse"], code) as devices:
+        for number in (0, 1):
+            devices.says(f"/dev/hidraw{number} is held by another program: close that one")
+        devices.says("(True, False)")
+        devices.says("first")
+        devices.do("spacemouse deflect 350 0 0")
+        devices.ends()

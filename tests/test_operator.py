@@ -94,6 +94,20 @@ def test_plugged_in_while_deflected_is_rest_until_the_puck_was_let_go() -> None:
     assert mouse.poll().axes[0] == 1
 
 
+@pytest.mark.parametrize("joined", [False, True])
+@given(st.lists(st.tuples(st.integers(0, 5), st.floats(0, 1)), min_size=1, max_size=12))
+def test_no_silence_and_no_half_at_rest_arms_a_puck_that_was_heard_deflected(
+    joined: bool, pushes: list[tuple[int, float]]
+) -> None:
+    device, clock = EmulatedSpaceMouse(joined=joined), Clock()
+    mouse = SpaceMouse(device, clock=clock)
+    for axis_, silent_s in pushes:
+        device.deflect(*(350 if n == axis_ else 0 for n in range(6)))
+        assert mouse.poll().axes == REST
+        clock.now_s += silent_s
+        assert mouse.poll().axes == REST
+
+
 def test_an_untouched_puck_says_nothing_and_may_jog_at_its_first_push() -> None:
     device, clock = EmulatedSpaceMouse(joined=True), Clock()
     mouse = SpaceMouse(device, clock=clock)
