@@ -6,11 +6,15 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
 
 import pytest
 
+from adof_cl.cli import main
+from adof_drivers.emulators.hid import KINDS, operator
 from adof_drivers.emulators.hid_nodes import command
-from adof_drivers.errors import DriverError
+from adof_drivers.errors import DriverError, RequestError
 
 PROGRAM = """
 import subprocess, sys, time
@@ -69,7 +73,9 @@ def installed() -> bool:
     return True
 
 
-pytestmark = pytest.mark.skipif(not installed(), reason="umockdev with its Python bindings is not installed")
+needs_umockdev = pytest.mark.skipif(
+    not installed(), reason="umockdev with its Python bindings is not installed"
+)
 
 
 class Session:
@@ -99,7 +105,7 @@ class Session:
 @contextmanager
 def session(kinds: list[str], code: str) -> Iterator[Session]:
     with subprocess.Popen(
-        command(kinds, [sys.executable, "-c", PROGRAM + code]),
+        command(kinds, [sys.executable, "-c", PROGRAM + code], script="-"),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -111,6 +117,7 @@ def session(kinds: list[str], code: str) -> Iterator[Session]:
             process.kill()
 
 
+@needs_umockdev
 def test_a_spacemouse_unplugged_while_deflected_rests_and_moves_nothing_when_it_is_back() -> None:
     code = """
 mouse = SpaceMouse.open()
@@ -147,6 +154,7 @@ again.close()
         ]
 
 
+@needs_umockdev
 @pytest.mark.parametrize(("kind", "form"), [("pedal", "joystick"), ("keyboard-pedal", "keyboard")])
 def test_a_pedal_stops_when_pressed_and_when_unplugged_until_it_is_opened_again(kind: str, form: str) -> None:
     code = f"""
@@ -176,6 +184,7 @@ again.close()
         devices.ends()
 
 
+@needs_umockdev
 def test_a_relay_that_sticks_or_goes_is_told_and_is_off_when_plugged_in_again() -> None:
     code = """
 relay = HidRelay.open()
@@ -206,6 +215,7 @@ again.close()
         assert noticed[-2:] == ["relay: on 1", "relay: all off"]  # closed: off
 
 
+@needs_umockdev
 def test_another_device_on_a_port_is_named_and_nothing_is_sent_to_it() -> None:
     code = """
 say(refusal(lambda: HidRelay.open("/dev/hidraw0")))
@@ -223,6 +233,7 @@ say(refusal(lambda: StopPedal.open("/dev/hidraw7")).partition(" (")[0])
         assert all("plugged in" in line for line in devices.ends())
 
 
+@needs_umockdev
 def test_a_second_program_is_refused_and_the_first_goes_on() -> None:
     code = """
 relay, mouse = HidRelay.open(), SpaceMouse.open()
@@ -250,3 +261,59 @@ HidRelay.open().close()
         devices.says("first")
         devices.do("spacemouse deflect 350 0 0")
         devices.ends()
+
+
+@needs_umockdev
+def test_the_command_runs_a_program_among_devices_and_passes_its_exit_code_on(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    script = tmp_path / "script"
+    script.write_text("wait 0\npedal press\n", encoding="utf-8")
+    code = (
+        PROGRAM
+        + "until(StopPedal.open(), lambda state: state.stop); print(refusal(SpaceMouse.open)); sys.exit(7)"
+    )
+    with pytest.raises(SystemExit) as exit_:
+        main(["emulate", "hid", "pedal", "--script", str(script), "--", sys.executable, "-c", code])
+    assert exit_.value.code == 7
+    said, noticed = capfd.readouterr()
+    assert said.startswith("no SpaceMouse is connected")
+    assert noticed == "pedal: plugged in at /dev/hidraw0\n"
+
+
+def test_what_is_no_command_is_refused_before_a_program_runs(tmp_path: Path) -> None:
+    for line, said in (
+        ("mouse deflect 1 2 3", "is no device here"),
+        ("spacemouse deflect 1 2", "'deflect X Y Z"),
+        ("spacemouse deflect 1 2 99999", "'deflect X Y Z"),
+        ("spacemouse press -1", "'press"),
+        ("spacemouse", "'report HEX'"),
+        ("pedal report xy", "'report HEX'"),
+        ("pedal release now", "'release'"),
+        ("wait -1", "0 or more seconds"),
+        ("wait", "0 or more seconds"),
+    ):
+        script = tmp_path / "script"
+        script.write_text(f"wait 0.1\n\n{line}\n", encoding="utf-8")
+        with pytest.raises(RequestError, match=f"line 3.*{said}"):
+            command(["spacemouse", "pedal"], ["true"], script=str(script))
+    for kinds, program, options in (
+        (["mouse"], ["true"], {}),
+        ([], ["true"], {}),
+        (["relay", "relay"], ["true"], {}),
+        (["relay"], [], {}),
+        (["relay"], ["true"], {"seed": 1, "script": "-"}),
+        (["relay"], ["true"], {"script": str(tmp_path / "none")}),
+    ):
+        with pytest.raises(RequestError):
+            command(kinds, program, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_seed_draws_the_same_commands_again_and_every_one_can_be_obeyed(seed: int) -> None:
+    lines = list(islice(operator(list(KINDS), seed), 200))
+    assert lines == list(islice(operator(list(KINDS), seed), 200))
+    for kind, *words in map(str.split, lines):
+        if kind != "wait" and words not in (["plug"], ["unplug"]):
+            KINDS[kind]().obey(words)
+    assert any("unplug" in line for line in lines)

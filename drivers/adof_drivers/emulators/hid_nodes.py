@@ -1,9 +1,9 @@
 """Emulated HID devices on /dev/hidraw*, for a program that opens them with the real hidapi.
 
-    umockdev-wrapper /usr/bin/python3 hid_nodes.py KINDS [--seed N] PROGRAM [ARGUMENT...]
+    umockdev-wrapper /usr/bin/python3 hid_nodes.py KINDS [--script FILE | --seed N] -- PROGRAM [ARGUMENT...]
 
-KINDS, separated by commas, are plugged in, and PROGRAM runs with them. Lines from standard input, or those
-that the seed draws, are obeyed one by one:
+KINDS, separated by commas, are plugged in, and PROGRAM runs with them. Lines of the script (`-`: standard
+input), or those that the seed draws, are obeyed one by one:
 
     wait SECONDS
     KIND unplug | KIND plug        a device that was plugged in again is a new one, with the next number
@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import math
 import os
 import select
 import shutil
@@ -43,13 +44,18 @@ _TERMINAL_NUMBER = 0x80045430  # TIOCGPTN
 _TICK_S = 0.016
 
 
-def command(kinds: Sequence[str], program: Sequence[str], *, seed: int | None = None) -> list[str]:
+def command(
+    kinds: Sequence[str], program: Sequence[str], *, script: str | None = None, seed: int | None = None
+) -> list[str]:
     """Return the command that runs `program` among devices of these kinds.
+
+    What happens to them is read from `script`, "-" for standard input, or drawn from `seed`; without either
+    they are at rest.
 
     Raises
     ------
     RequestError
-        An unknown kind, one twice, or no program.
+        An unknown kind, one twice, no program, or a line in `script` that cannot be obeyed.
     DriverError
         umockdev is not installed.
     """
@@ -61,6 +67,10 @@ def command(kinds: Sequence[str], program: Sequence[str], *, seed: int | None = 
         raise RequestError(
             "no program was given: the devices are only there for the one that is run with them"
         )
+    if script is not None and seed is not None:
+        raise RequestError("a script and a seed were given: one of them says what happens to the devices")
+    if script not in (None, "-"):
+        _rehearse(Path(str(script)), kinds)
     bindings = "import gi; gi.require_version('UMockdev', '1.0'); from gi.repository import UMockdev"
     if (
         shutil.which("umockdev-wrapper") is None
@@ -73,8 +83,37 @@ def command(kinds: Sequence[str], program: Sequence[str], *, seed: int | None = 
             "HID devices are emulated by umockdev, which is not installed: "
             "apt install umockdev gir1.2-umockdev-1.0 python3-gi"
         )
-    drawn = [] if seed is None else ["--seed", str(seed)]
-    return ["umockdev-wrapper", _SYSTEM_PYTHON, str(Path(__file__)), ",".join(kinds), *drawn, *program]
+    told = ["--script", script] if script is not None else ["--seed", str(seed)] if seed is not None else []
+    return ["umockdev-wrapper", _SYSTEM_PYTHON, str(Path(__file__)), ",".join(kinds), *told, "--", *program]
+
+
+def _rehearse(script: Path, kinds: Sequence[str]) -> None:
+    """Refuse a script with a line that nobody could obey."""
+    try:
+        lines = script.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as failure:
+        raise RequestError(f"{script} cannot be read ({failure}): give a script of commands") from None
+    for number, line in enumerate(lines, 1):
+        kind, *words = line.split() or ["wait", "0"]
+        try:
+            if kind == "wait":
+                _duration_s(words)
+            elif kind not in kinds:
+                raise RequestError(f"{kind!r} is no device here: wait, {' or '.join(kinds)} was wanted")
+            elif words not in (["plug"], ["unplug"]):
+                KINDS[kind]().obey(words)
+        except RequestError as failure:
+            raise RequestError(f"{script}, line {number}: {failure}") from None
+
+
+def _duration_s(words: Sequence[str]) -> float:
+    try:
+        (duration_s,) = map(float, words)
+    except ValueError:
+        duration_s = math.nan
+    if not 0 <= duration_s < math.inf:
+        raise RequestError(f"'wait {' '.join(words)}': 0 or more seconds were wanted")
+    return duration_s
 
 
 class _Node:
@@ -223,8 +262,8 @@ class _Bus:
         words = line.split()
         if not words:
             return
-        if words[0] == "wait" and len(words) == 2:
-            time.sleep(float(words[1]))
+        if words[0] == "wait":
+            time.sleep(_duration_s(words[1:]))
             return
         with self._lock:
             node = self._nodes.get(words[0])
@@ -257,27 +296,30 @@ def _play(bus: _Bus, lines: Iterable[str]) -> None:
     for line in lines:
         try:
             bus.obey(line)
-        except (RequestError, ValueError) as failure:
+        except RequestError as failure:
             sys.stderr.write(f"{failure}\n")
             sys.stderr.flush()
 
 
 def main(arguments: list[str]) -> int:
     """Run the program among the devices; its exit code is ours."""
-    kinds, *program = arguments
-    seeded = program[0] == "--seed"
-    if seeded:
-        lines: Iterable[str] = operator(kinds.split(","), int(program[1]))
-        program = program[2:]
-    else:
-        # Unbuffered: whoever waits in a buffer's read must not be left behind at the end.
-        lines = (line.decode() for line in open(0, "rb", buffering=0, closefd=False))  # noqa: SIM115
+    kinds, *told = arguments[: arguments.index("--")]
+    program = arguments[arguments.index("--") + 1 :]
+    match told:
+        case ["--seed", seed]:
+            lines = operator(kinds.split(","), int(seed))
+        case ["--script", script]:
+            # Unbuffered: whoever waits in a buffer's read must not be left behind at the end.
+            source = open(0 if script == "-" else script, "rb", buffering=0)  # noqa: SIM115, PTH123
+            lines = (line.decode() for line in source)
+        case _:
+            lines = iter(())
     bus = _Bus(kinds.split(","))
     for work in (bus.loop.run, bus.serve):
         threading.Thread(target=work, daemon=True).start()
     child = subprocess.Popen(  # noqa: S603  (the user's own program)
         program,
-        stdin=None if seeded else subprocess.DEVNULL,
+        stdin=subprocess.DEVNULL if told == ["--script", "-"] else None,
         env=os.environ | {"UMOCKDEV_DIR": bus.testbed.get_root_dir()},
     )
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal tells the program too
