@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from adof_drivers.camera import Frame, WatchedCamera
 from adof_drivers.camera_pair import CameraPair
 from adof_drivers.emulators.gige import Faults, GigeCameraEmulator, Region
+from adof_drivers.emulators.gige_features import PIXEL_FORMATS
 from adof_drivers.errors import DeviceLostError, DriverError, FrameTimeoutError, FrozenFramesError
 from adof_drivers.gige import BlockNumbers, GigeCamera, answers
 
@@ -49,22 +50,30 @@ def emulated(faults: Faults | None = None, rate_hz: float = 100) -> GigeCameraEm
 
 
 @needs_viva
-@pytest.mark.parametrize("padding", [0, 3])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_frames_arrive_bit_for_bit_with_the_stride_they_were_sent_with(padding: int, dtype: type) -> None:
-    def source(number: int, region: Region) -> np.ndarray:
-        return scene(number, region, dtype)
+@pytest.mark.parametrize(
+    ("pixel_format", "padding"),
+    [(name, 0) for name in PIXEL_FORMATS] + [("Mono8", 3), ("Mono12", 3), ("Mono16", 3)],
+)
+def test_frames_arrive_bit_for_bit_with_the_stride_they_were_sent_with(
+    pixel_format: str, padding: int
+) -> None:
+    depth = PIXEL_FORMATS[pixel_format][1]
+    dtype = np.uint8 if depth == 8 else np.uint16
 
-    with GigeCameraEmulator(
-        source, SENSOR, sixteen_bit=dtype is np.uint16, line_padding=padding, rate_hz=200
-    ):
+    def source(_number: int, region: Region) -> np.ndarray:
+        return scene(0, region, dtype) >> (np.iinfo(dtype).bits - depth)
+
+    with GigeCameraEmulator(source, SENSOR, pixel_format=pixel_format, line_padding=padding, rate_hz=200):
         camera = GigeCamera("127.0.0.1", packet_size=700)
-        camera.start()
-        for _ in range(10):
-            frame = camera.grab()
-            assert frame.complete
-            assert frame.stride_bytes == SENSOR[1] * np.dtype(dtype).itemsize + padding
-            np.testing.assert_array_equal(frame.pixels, whole(frame.number - 1, dtype))
+        for region in (((0, 0), SENSOR), ((3, 2), (11, 13)), ((0, 0), (1, 1))):
+            camera.configure(region=region)
+            camera.start()
+            for _ in range(2):
+                frame = camera.grab()
+                assert frame.complete
+                assert frame.stride_bytes == region[1][1] * np.dtype(dtype).itemsize + padding
+                np.testing.assert_array_equal(frame.pixels, source(0, region))
+            camera.stop()
         camera.close()
 
 
@@ -310,8 +319,13 @@ def test_an_address_already_taken_and_impossible_faults_are_refused() -> None:
     for wrong in ({"packet_loss": 1.5}, {"frame_loss": -0.1}, {"delay_s": -1.0}):
         with pytest.raises(DriverError):
             Faults(**wrong)
-    with pytest.raises(DriverError):
-        emulated(rate_hz=0)
+    for impossible in (
+        {"rate_hz": 0},
+        {"pixel_format": "RGB8"},
+        {"pixel_format": "Mono12p", "line_padding": 2},
+    ):
+        with pytest.raises(DriverError):
+            GigeCameraEmulator(scene, SENSOR, **impossible)  # type: ignore[arg-type]
 
 
 @needs_viva

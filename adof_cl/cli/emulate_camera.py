@@ -99,7 +99,7 @@ def camera(
                     shape,
                     address=here,
                     siblings=[other for other in addresses if other != here],
-                    sixteen_bit=sixteen_bit,
+                    pixel_format="Mono16" if sixteen_bit else "Mono8",
                     rate_hz=rate_hz,
                     faults=faults,
                 )

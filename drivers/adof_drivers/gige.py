@@ -13,6 +13,8 @@ from adof_drivers.camera import CameraSettings, DeviceClock, Frame, Trigger, req
 from adof_drivers.errors import DeviceLostError, DriverError, FrameTimeoutError
 
 _GREY = {"Mono8": "u1", "Mono10": "<u2", "Mono12": "<u2", "Mono14": "<u2", "Mono16": "<u2"}
+_PACKED = {"Mono10p": (4, 5), "Mono10Packed": (2, 3), "Mono12p": (2, 3), "Mono12Packed": (2, 3)}
+"""How many pixels share how many bytes."""
 _ASKED = 0.2  # seconds a camera on the same wire gets to answer; they answer within a few ms
 _TRIES = 2
 
@@ -86,6 +88,7 @@ class GigeCamera:
         self._packet_size = packet_size
         self._error = viva.GenicamError
         self._roi = viva.Roi
+        self._unpack = viva.Frame.from_bytes
         self._stream: Any = None
         self._acquiring = False
         self._lost = False
@@ -114,9 +117,10 @@ class GigeCamera:
             self.model = f"{here[0].manufacturer} {here[0].model}"
             self._tick_s = self._read_tick_s()
             self._format = self._camera.get_enum("PixelFormat")
-            if self._format not in _GREY:
+            if self._format not in {**_GREY, **_PACKED}:
                 raise DriverError(
-                    f"the camera at {address} sends {self._format}: set it to one of {', '.join(_GREY)}"
+                    f"the camera at {address} sends {self._format}: set it to one of "
+                    f"{', '.join((*_GREY, *_PACKED))}"
                 )
             self._sensor = (self._camera.get_integer("SensorHeight"), self._camera.get_integer("SensorWidth"))
             self.settings = self._read_settings("free")
@@ -259,16 +263,7 @@ class GigeCamera:
     def _frame(self, taken: Any, received_s: float) -> Frame:
         if taken.pixel_format != self._format:
             raise DriverError(f"a frame of {taken.pixel_format} came, the camera was set to {self._format}")
-        dtype = np.dtype(_GREY[self._format])
-        stride = taken.width * dtype.itemsize + taken.padding_x
-        payload = taken.payload()
-        if len(payload) < stride * taken.height - taken.padding_x:
-            raise DriverError(
-                f"a frame of {len(payload)} bytes came: {taken.height} lines of {stride} bytes were announced"
-            )
-        pixels: np.ndarray[Any, Any] = np.ndarray(
-            (taken.height, taken.width), dtype, buffer=payload, strides=(stride, dtype.itemsize)
-        )
+        pixels = self._unpacked(taken) if self._format in _PACKED else self._lines(taken)
         device_s = None if taken.ts_dev is None else taken.ts_dev * self._tick_s
         return Frame(
             pixels=pixels,
@@ -279,6 +274,48 @@ class GigeCamera:
             complete=taken.is_complete,
             origin_yx=self.settings.origin_yx,
         )
+
+    def _lines(self, taken: Any) -> np.ndarray[Any, Any]:
+        """The pixels as they lie in the payload, line by line."""
+        dtype = np.dtype(_GREY[self._format])
+        stride = taken.width * dtype.itemsize + taken.padding_x
+        payload = self._payload(taken, stride * taken.height - taken.padding_x)
+        return np.ndarray(
+            (taken.height, taken.width), dtype, buffer=payload, strides=(stride, dtype.itemsize)
+        )
+
+    def _unpacked(self, taken: Any) -> np.ndarray[Any, Any]:
+        """Pixels that share bytes, set apart by viva-genicam, which wants the last group whole."""
+        pixels, size = _PACKED[self._format]
+        if taken.padding_x and taken.width % pixels:
+            raise DriverError(
+                f"lines of {taken.width} pixels of {self._format} end within a byte and are padded: "
+                f"choose a width that is a multiple of {pixels}"
+            )
+        count = taken.width * taken.height
+        payload = self._payload(taken, -(-count * size // pixels) + taken.padding_x * (taken.height - 1))
+        whole = -(-count // pixels) * size + taken.padding_x * taken.height
+        try:
+            unpacked: np.ndarray[Any, Any] = self._unpack(
+                payload[:whole].ljust(whole, b"\x00"),
+                taken.width,
+                taken.height,
+                self._format,
+                taken.padding_x,
+            ).to_numpy()
+        except self._error as failure:
+            raise DriverError(f"a frame from {self.address} cannot be unpacked: {failure}") from failure
+        return unpacked
+
+    def _payload(self, taken: Any, wanted: int) -> bytes:
+        """Its bytes; those that a frame lacks which is known to be torn are 0."""
+        payload: bytes = taken.payload()
+        if len(payload) < wanted and taken.is_complete:
+            raise DriverError(
+                f"a frame of {len(payload)} bytes came: {taken.height} lines of {taken.width} pixels of "
+                f"{self._format} need {wanted}"
+            )
+        return payload.ljust(wanted, b"\x00")
 
     def _require_there(self) -> None:
         if not answers(self.address):

@@ -34,6 +34,7 @@ from adof_drivers.emulators.gige_features import (
     OFFSET_Y,
     PAYLOAD_SIZE,
     PIXEL_FORMAT,
+    PIXEL_FORMATS,
     SENSOR_HEIGHT,
     SENSOR_WIDTH,
     START,
@@ -47,7 +48,6 @@ from adof_drivers.emulators.gige_features import (
 from adof_drivers.errors import DriverError
 
 PORT = 3956
-MONO8, MONO16 = 0x01080001, 0x01100007
 
 _DISCOVERY, _RESEND, _READ_REGISTER, _WRITE_REGISTER, _READ_MEMORY, _WRITE_MEMORY = (
     0x02,
@@ -164,13 +164,16 @@ class GigeCameraEmulator:
     Parameters
     ----------
     source
-        Makes the pictures; uint8 becomes Mono8, uint16 Mono16.
+        Makes the pictures: uint8 for Mono8, uint16 for all else.
     sensor
         Rows and columns.
     address
         Where it listens; each camera needs one of its own. Keep to 127.0.0.0/8 unless others shall see it.
     siblings
         Addresses of other emulators that this one names when asked who is there: clients ask 127.0.0.1 alone.
+    pixel_format
+        One of `gige_features.PIXEL_FORMATS`; pixels of packed ones follow each other bit for bit, over the
+        ends of lines.
     rate_hz, exposure_us
         As switched on; clients may change them.
     line_padding
@@ -186,7 +189,8 @@ class GigeCameraEmulator:
     Raises
     ------
     DriverError
-        The address cannot be had, or a picture of another size or type than promised.
+        The address cannot be had, an unknown pixel format, line padding with a packed one, or a picture of
+        another size, type or depth than promised.
     """
 
     def __init__(
@@ -196,7 +200,7 @@ class GigeCameraEmulator:
         *,
         address: str = "127.0.0.1",
         siblings: Sequence[str] = (),
-        sixteen_bit: bool = False,
+        pixel_format: str = "Mono8",
         rate_hz: float = 60.0,
         exposure_us: float = 5000.0,
         line_padding: int = 0,
@@ -206,15 +210,24 @@ class GigeCameraEmulator:
             raise DriverError(f"rate_hz is {rate_hz}: a rate above 0 was wanted")
         if min(sensor) < 1:
             raise DriverError(f"sensor is {sensor}: (rows, columns) of 1 or more were wanted")
+        if pixel_format not in PIXEL_FORMATS:
+            raise DriverError(
+                f"pixel_format is '{pixel_format}': one of {', '.join(PIXEL_FORMATS)} was wanted"
+            )
+        code, self._depth = PIXEL_FORMATS[pixel_format]
+        self._bits = code >> 16 & 0xFF
+        if line_padding and self._bits % 8:
+            raise DriverError(f"line_padding is {line_padding}: lines of {pixel_format} do not end on a byte")
         self._source = source
-        self._dtype = np.dtype(np.uint16 if sixteen_bit else np.uint8)
+        self._pixel_format = pixel_format
+        self._dtype = np.dtype(np.uint8 if self._depth == 8 else np.uint16)
         self.address = address
         self.sent = 0
         self.resent = 0
         self.failure: BaseException | None = None
         self._siblings = tuple(siblings)
         self._faults = faults or Faults()
-        self._memory = _memory(address, sensor, self._dtype, rate_hz, exposure_us, line_padding)
+        self._memory = _memory(address, sensor, pixel_format, rate_hz, exposure_us, line_padding)
         self._controller: tuple[str, int] | None = None
         self._heard_s = 0.0
         self._acquiring = threading.Event()
@@ -427,8 +440,8 @@ class GigeCameraEmulator:
         if self._acquiring.is_set():
             return _ACCESS_DENIED
         self._set(address, value)
-        line = wanted[WIDTH] * self._dtype.itemsize + self._get(LINE_PADDING)
-        self._set(PAYLOAD_SIZE, line * wanted[HEIGHT])
+        shape = (wanted[HEIGHT], wanted[WIDTH])
+        self._set(PAYLOAD_SIZE, _payload_bytes(shape, self._bits, self._get(LINE_PADDING)))
         return 0
 
     def _release(self) -> None:
@@ -513,15 +526,14 @@ class GigeCameraEmulator:
             raise DriverError(
                 f"exposure {number} is {pixels.shape} {pixels.dtype}: {shape} {self._dtype} was wanted"
             )
+        if int(pixels.max()) >> self._depth:
+            raise DriverError(f"exposure {number} has a {pixels.max()}: {self._depth} bits were wanted")
         return pixels
 
     def _cut(self, block: int, pixels: NDArray[Any], ticks: int) -> _Block:
         rows, columns = pixels.shape
         padding = self._get(LINE_PADDING)
-        lines = np.zeros((rows, columns * self._dtype.itemsize + padding), np.uint8)
-        little = np.ascontiguousarray(pixels, dtype=self._dtype.newbyteorder("<"))
-        lines[:, : columns * self._dtype.itemsize] = little.view(np.uint8)
-        data = lines.tobytes()
+        data = self._packed(pixels) if self._bits % 8 else self._lines(pixels, padding)
         leader = struct.pack(
             ">HHIIIIIIIHH",
             0,
@@ -547,6 +559,24 @@ class GigeCameraEmulator:
                 for index, (kind, body) in enumerate(bodies)
             ),
         )
+
+    def _lines(self, pixels: NDArray[Any], padding: int) -> bytes:
+        rows, columns = pixels.shape
+        lines = np.zeros((rows, columns * self._dtype.itemsize + padding), np.uint8)
+        little = np.ascontiguousarray(pixels, dtype=self._dtype.newbyteorder("<"))
+        lines[:, : columns * self._dtype.itemsize] = little.view(np.uint8)
+        return lines.tobytes()
+
+    def _packed(self, pixels: NDArray[Any]) -> bytes:
+        """Low bits first; in the older Mono12Packed the byte between two pixels has both low halves."""
+        flat = pixels.ravel()
+        if self._pixel_format == "Mono12Packed":
+            pairs = np.resize(flat, (flat.size + 1) // 2 * 2).reshape(-1, 2)
+            first, second = pairs[:, 0], pairs[:, 1]
+            triples = np.stack([first >> 4, first & 15 | (second & 15) << 4, second >> 4], axis=1)
+            return triples.astype(np.uint8).tobytes()[: -(-flat.size * self._bits // 8)]
+        bits = flat[:, None] >> np.arange(self._depth, dtype=np.uint16) & 1
+        return np.packbits(bits.astype(np.uint8), bitorder="little").tobytes()
 
     def _transmit(self, block: _Block, draw: np.random.Generator) -> None:
         lost = draw.random(len(block.packets)) < self._faults.packet_loss
@@ -588,10 +618,15 @@ def _identity(address: str) -> bytearray:
     return memory
 
 
+def _payload_bytes(shape: tuple[int, int], bits: int, padding: int) -> int:
+    rows, columns = shape
+    return -(-rows * columns * bits // 8) + rows * padding
+
+
 def _memory(
     address: str,
     sensor: tuple[int, int],
-    dtype: np.dtype[Any],
+    pixel_format: str,
     rate_hz: float,
     exposure_us: float,
     line_padding: int,
@@ -601,7 +636,8 @@ def _memory(
     identity = _identity(address)
     memory[: len(identity)] = identity
     rows, columns = sensor
-    xml = description(sixteen_bit=dtype.itemsize == 2).encode()
+    xml = description(pixel_format).encode()
+    code = PIXEL_FORMATS[pixel_format][0]
     memory[XML_ADDRESS : XML_ADDRESS + len(xml)] = xml
     url = f"Local:adof.xml;{XML_ADDRESS:x};{len(xml):x}".encode()
     memory[0x200 : 0x200 + len(url)] = url
@@ -617,9 +653,9 @@ def _memory(
         (SENSOR_HEIGHT, rows),
         (WIDTH, columns),
         (HEIGHT, rows),
-        (PIXEL_FORMAT, MONO16 if dtype.itemsize == 2 else MONO8),
+        (PIXEL_FORMAT, code),
         (LINE_PADDING, line_padding),
-        (PAYLOAD_SIZE, rows * (columns * dtype.itemsize + line_padding)),
+        (PAYLOAD_SIZE, _payload_bytes(sensor, code >> 16 & 0xFF, line_padding)),
     ):
         struct.pack_into(">I", memory, register, value)
     struct.pack_into(">f", memory, EXPOSURE_US, exposure_us)
