@@ -5,6 +5,8 @@ from __future__ import annotations
 import socket
 import struct
 import time
+import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,11 +14,31 @@ import numpy as np
 from adof_drivers.camera import CameraSettings, DeviceClock, Frame, Trigger, require_settings
 from adof_drivers.errors import DeviceLostError, DriverError, FrameTimeoutError
 
-_GREY = {"Mono8": "u1", "Mono10": "<u2", "Mono12": "<u2", "Mono14": "<u2", "Mono16": "<u2"}
 _PACKED = {"Mono10p": (4, 5), "Mono10Packed": (2, 3), "Mono12p": (2, 3), "Mono12Packed": (2, 3)}
+_GROUPS = {"Mono8": (1, 1), **dict.fromkeys(("Mono10", "Mono12", "Mono14", "Mono16"), (1, 2)), **_PACKED}
 """How many pixels share how many bytes."""
 _ASKED = 0.2  # seconds a camera on the same wire gets to answer; they answer within a few ms
 _TRIES = 2
+_LARGEST_BUFFER = Path("/proc/sys/net/core/rmem_max")
+
+
+def buffer_advice(frame_bytes: int) -> str | None:
+    """Say what to do if the system lets a socket keep less than two frames; else None.
+
+    What comes while this program waits for its turn is kept there, and dropped beyond.
+    """
+    try:
+        largest = int(_LARGEST_BUFFER.read_text(encoding="ascii"))
+    except (OSError, ValueError):  # another system
+        return None
+    if largest >= 2 * frame_bytes:
+        return None
+    mib = 1 << 20
+    wanted = max(4, -(-2 * frame_bytes // mib)) * mib
+    return (
+        f"the system lets a socket keep {largest} bytes, two frames have {2 * frame_bytes}: frames will be "
+        f"lost when the computer is busy; sudo sysctl -w net.core.rmem_max={wanted}"
+    )
 
 
 def answers(address: str, port: int = 3956) -> bool:
@@ -44,8 +66,11 @@ class BlockNumbers:
         self._last: int | None = None
         self._last_block = 0
 
-    def number(self, block: int) -> int:
-        """Return the frame's number, on from the first block seen; below the last one if out of order."""
+    def number(self, block: int, *, believed: bool = True) -> int:
+        """Return the frame's number, on from the first block seen; below the last one if out of order.
+
+        One that is not `believed`, for the frame is torn, is not counted on from.
+        """
         if self._last is None:
             self._last, self._last_block = block, block
             return block
@@ -53,7 +78,7 @@ class BlockNumbers:
         if max(block, self._last_block) <= 0xFFFF:
             step = (step + 0x7FFF) % 0xFFFF - 0x7FFF
         number = self._last + step
-        if step > 0:
+        if step > 0 and believed:
             self._last, self._last_block = number, block
         return number
 
@@ -117,11 +142,11 @@ class GigeCamera:
             self.model = f"{here[0].manufacturer} {here[0].model}"
             self._tick_s = self._read_tick_s()
             self._format = self._camera.get_enum("PixelFormat")
-            if self._format not in {**_GREY, **_PACKED}:
+            if self._format not in _GROUPS:
                 raise DriverError(
-                    f"the camera at {address} sends {self._format}: set it to one of "
-                    f"{', '.join((*_GREY, *_PACKED))}"
+                    f"the camera at {address} sends {self._format}: set it to one of {', '.join(_GROUPS)}"
                 )
+            self._dtype = np.dtype("u1" if self._format == "Mono8" else "<u2")
             self._sensor = (self._camera.get_integer("SensorHeight"), self._camera.get_integer("SensorWidth"))
             self.settings = self._read_settings("free")
             self._camera.disable_trigger("FrameStart")
@@ -204,10 +229,13 @@ class GigeCamera:
         return self.settings
 
     def start(self) -> None:
-        """Begin to acquire; frames count from 1, or where the camera begins."""
+        """Begin to acquire; frames count from 1, or where the camera begins. Warns of a small buffer."""
         if self._stream is not None:
             return
         self._clock, self._numbers = DeviceClock(), BlockNumbers()
+        (rows, columns), (pixels, size) = self.shape, _GROUPS[self._format]
+        if advice := buffer_advice(rows * columns * size // pixels):
+            warnings.warn(advice, stacklevel=2)
         try:
             self._stream = self._camera.stream(
                 iface=self._interface,
@@ -261,40 +289,51 @@ class GigeCamera:
         return self._frame(taken, received_s)
 
     def _frame(self, taken: Any, received_s: float) -> Frame:
-        if taken.pixel_format != self._format:
-            raise DriverError(f"a frame of {taken.pixel_format} came, the camera was set to {self._format}")
-        pixels = self._unpacked(taken) if self._format in _PACKED else self._lines(taken)
+        complete = bool(taken.is_complete)
         device_s = None if taken.ts_dev is None else taken.ts_dev * self._tick_s
         return Frame(
-            pixels=pixels,
-            number=self._numbers.number(taken.block_id),
-            time_s=received_s if device_s is None else self._clock.host_s(device_s, received_s),
+            pixels=self._pixels(taken) if complete else np.zeros(self.shape, self._dtype),
+            number=self._numbers.number(taken.block_id, believed=complete),
+            time_s=received_s
+            if device_s is None or not complete
+            else self._clock.host_s(device_s, received_s),
             received_s=received_s,
             device_time_s=device_s,
-            complete=taken.is_complete,
+            complete=complete,
             origin_yx=self.settings.origin_yx,
         )
 
-    def _lines(self, taken: Any) -> np.ndarray[Any, Any]:
-        """The pixels as they lie in the payload, line by line."""
-        dtype = np.dtype(_GREY[self._format])
-        stride = taken.width * dtype.itemsize + taken.padding_x
-        payload = self._payload(taken, stride * taken.height - taken.padding_x)
-        return np.ndarray(
-            (taken.height, taken.width), dtype, buffer=payload, strides=(stride, dtype.itemsize)
-        )
-
-    def _unpacked(self, taken: Any) -> np.ndarray[Any, Any]:
-        """Pixels that share bytes, set apart by viva-genicam, which wants the last group whole."""
-        pixels, size = _PACKED[self._format]
-        if taken.padding_x and taken.width % pixels:
+    def _pixels(self, taken: Any) -> np.ndarray[Any, Any]:
+        """The pixels of a whole frame; unless they share bytes, as they lie in the payload, line by line."""
+        shape = (taken.height, taken.width)
+        if taken.pixel_format != self._format or shape != self.shape:
+            raise DriverError(
+                f"a frame of {shape} {taken.pixel_format} came from the camera at {self.address}, which was "
+                f"set to {self.shape} {self._format}: open it again"
+            )
+        grouped, size = _GROUPS[self._format]
+        if taken.padding_x and taken.width % grouped:
             raise DriverError(
                 f"lines of {taken.width} pixels of {self._format} end within a byte and are padded: "
-                f"choose a width that is a multiple of {pixels}"
+                f"choose a width that is a multiple of {grouped}"
             )
-        count = taken.width * taken.height
-        payload = self._payload(taken, -(-count * size // pixels) + taken.padding_x * (taken.height - 1))
-        whole = -(-count // pixels) * size + taken.padding_x * taken.height
+        payload = taken.payload()
+        pixels = -(-taken.width * taken.height * size // grouped)
+        excess = len(payload) - pixels - taken.padding_x * taken.height
+        # The last line may come without its padding, and a payload be rounded up, but not by a line.
+        if not -taken.padding_x <= excess < taken.width * size / grouped:
+            raise DriverError(
+                f"a frame of {len(payload)} bytes came: {taken.height} lines of {taken.width} pixels of "
+                f"{self._format}, each padded by {taken.padding_x}, were announced"
+            )
+        if self._format in _PACKED:
+            return self._unpacked(taken, payload, -(-taken.width * taken.height // grouped) * size)
+        stride = taken.width * size + taken.padding_x
+        return np.ndarray(shape, self._dtype, buffer=payload, strides=(stride, size))
+
+    def _unpacked(self, taken: Any, payload: bytes, groups: int) -> np.ndarray[Any, Any]:
+        """Pixels that share bytes, set apart by viva-genicam, which wants the last group whole."""
+        whole = groups + taken.padding_x * taken.height
         try:
             unpacked: np.ndarray[Any, Any] = self._unpack(
                 payload[:whole].ljust(whole, b"\x00"),
@@ -306,16 +345,6 @@ class GigeCamera:
         except self._error as failure:
             raise DriverError(f"a frame from {self.address} cannot be unpacked: {failure}") from failure
         return unpacked
-
-    def _payload(self, taken: Any, wanted: int) -> bytes:
-        """Its bytes; those that a frame lacks which is known to be torn are 0."""
-        payload: bytes = taken.payload()
-        if len(payload) < wanted and taken.is_complete:
-            raise DriverError(
-                f"a frame of {len(payload)} bytes came: {taken.height} lines of {taken.width} pixels of "
-                f"{self._format} need {wanted}"
-            )
-        return payload.ljust(wanted, b"\x00")
 
     def _require_there(self) -> None:
         if not answers(self.address):

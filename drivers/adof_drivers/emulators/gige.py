@@ -118,6 +118,9 @@ class Faults:
         Share of frames of which nothing is sent, though they are counted.
     swapped
         Share of frames sent after the one that follows them.
+    garbled
+        Share of packets, replies and frames' alike, that are malformed: cut, lengthened, their fields
+        changed; pixels are not, for nothing could tell.
     delay_s
         Frames are late by up to this.
     freeze_at, stall_at, disconnect_at
@@ -128,13 +131,14 @@ class Faults:
     packet_loss: float = 0.0
     frame_loss: float = 0.0
     swapped: float = 0.0
+    garbled: float = 0.0
     delay_s: float = 0.0
     freeze_at: int | None = None
     stall_at: int | None = None
     disconnect_at: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("packet_loss", "frame_loss", "swapped"):
+        for name in ("packet_loss", "frame_loss", "swapped", "garbled"):
             share = getattr(self, name)
             if not 0 <= share <= 1:
                 raise DriverError(f"{name} is {share}: a share from 0 to 1 was wanted")
@@ -144,6 +148,19 @@ class Faults:
     def draw(self, number: int) -> np.random.Generator:
         """Return the generator of exposure `number`."""
         return np.random.default_rng([self.seed, number])
+
+
+def _garble(packet: bytes, fields: int, draw: np.random.Generator) -> bytes:
+    """Cut a packet, lengthen it, or change some of its first `fields` bytes."""
+    kind = draw.integers(4)
+    if kind == 0:
+        return packet[: int(draw.integers(len(packet)))]
+    if kind == 1:
+        return packet + draw.bytes(int(draw.integers(1, 64)))
+    changed = bytearray(packet)
+    for place in draw.integers(min(fields, len(packet)), size=int(draw.integers(1, 5))):
+        changed[place] = draw.integers(256)
+    return bytes(changed)
 
 
 def _reached(limit: int | None, number: int) -> bool:
@@ -236,6 +253,7 @@ class GigeCameraEmulator:
         self._kept: OrderedDict[int, _Block] = OrderedDict()
         self._kept_lock = threading.Lock()
         self._exposures = 0
+        self._replies = self._faults.draw(-1 % (1 << 32))
         self._lost = False
         self._threads: list[threading.Thread] = []
         self._control = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -323,7 +341,7 @@ class GigeCameraEmulator:
         if command == _DISCOVERY:
             for address in (self.address, *self._siblings):
                 identity = bytes(_identity(address))
-                self._control.sendto(struct.pack(">HHHH", 0, 3, len(identity), request) + identity, peer)
+                self._reply(struct.pack(">HHHH", 0, 3, len(identity), request) + identity, peer)
             return
         if peer == self._controller:
             self._heard_s = time.monotonic()
@@ -338,7 +356,12 @@ class GigeCameraEmulator:
         }.get(command)
         status, reply = handler(body, peer) if handler else (_NOT_IMPLEMENTED, b"")
         if answer:
-            self._control.sendto(struct.pack(">HHHH", status, command + 1, len(reply), request) + reply, peer)
+            self._reply(struct.pack(">HHHH", status, command + 1, len(reply), request) + reply, peer)
+
+    def _reply(self, packet: bytes, peer: tuple[str, int]) -> None:
+        if self._replies.random() < self._faults.garbled:
+            packet = _garble(packet, 8, self._replies)
+        self._control.sendto(packet, peer)
 
     def _read_registers(self, body: bytes, _peer: tuple[str, int]) -> tuple[int, bytes]:
         reply = b""
@@ -580,9 +603,12 @@ class GigeCameraEmulator:
 
     def _transmit(self, block: _Block, draw: np.random.Generator) -> None:
         lost = draw.random(len(block.packets)) < self._faults.packet_loss
+        garbled = draw.random(len(block.packets)) < self._faults.garbled
+        last = len(block.packets) - 1
         for index, packet in enumerate(block.packets):
-            if not (lost[index] and 0 < index < len(block.packets) - 1):
-                self._send(packet)
+            if lost[index] and 0 < index < last:
+                continue
+            self._send(_garble(packet, 8 if 0 < index < last else 48, draw) if garbled[index] else packet)
         self.sent += 1
 
     def _resend(self, body: bytes) -> None:
