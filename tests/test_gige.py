@@ -328,6 +328,26 @@ def test_no_camera_at_an_address_says_so_and_names_those_there_are() -> None:
 
 
 @needs_viva
+def test_another_camera_than_wanted_is_refused_named_and_given_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with emulated() as emulator:
+        with pytest.raises(
+            DriverError, match=r"at 127\.0\.0\.1 is camera 'EMU7f000001', 'EMU7f000002' was wanted"
+        ):
+            GigeCamera("127.0.0.1", serial="EMU7f000002")
+        assert not emulator.controlled
+        right = GigeCamera("127.0.0.1", serial="EMU7f000001")
+        assert right.serial == "EMU7f000001"
+        right.close()
+    monkeypatch.setitem(PIXEL_FORMATS, "BayerRG8", (0x01080009, 8))
+    with GigeCameraEmulator(scene, SENSOR, pixel_format="BayerRG8") as emulator:
+        with pytest.raises(DriverError, match="sends BayerRG8: set it to one of Mono8, "):
+            GigeCamera("127.0.0.1")
+        assert not emulator.controlled
+
+
+@needs_viva
 def test_two_cameras_are_paired_and_the_one_that_is_lost_is_named() -> None:
     with (
         GigeCameraEmulator(scene, SENSOR, siblings=["127.0.0.2"]) as one,

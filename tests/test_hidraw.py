@@ -222,6 +222,9 @@ say(refusal(lambda: HidRelay.open("/dev/hidraw0")))
 say(refusal(lambda: SpaceMouse.open("/dev/hidraw1")).partition(" (")[0])
 say(refusal(lambda: StopPedal.open("/dev/hidraw2")).partition(" (")[0])
 say(refusal(lambda: StopPedal.open("/dev/hidraw7")).partition(" (")[0])
+from adof_drivers import hid_device, pedal, spacemouse
+either = spacemouse.IDENTITIES | pedal.JOYSTICK_IDENTITIES
+say(refusal(lambda: hid_device.open_hid("jog or pedal", either)))
 """
     with session(["spacemouse", "pedal", "relay"], code) as devices:
         devices.says(
@@ -230,6 +233,9 @@ say(refusal(lambda: StopPedal.open("/dev/hidraw7")).partition(" (")[0])
         devices.says("at /dev/hidraw1 is 05f3:00ff 'VEC Footpedal', no SpaceMouse")
         devices.says("at /dev/hidraw2 is 16c0:05df 'USBRelay2', no foot pedal")
         devices.says("/dev/hidraw7 cannot be opened")
+        devices.says(
+            "several devices are a jog or pedal: /dev/hidraw0, /dev/hidraw1; name one of these paths"
+        )
         assert all("plugged in" in line for line in devices.ends())
 
 

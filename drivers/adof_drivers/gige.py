@@ -95,15 +95,29 @@ class GigeCamera:
         else every interface is searched. Finding a camera broadcasts on the interface.
     packet_size
         Bytes of a network packet; default: the largest that gets through, as tried out.
+    serial
+        Its serial number, to be sure of which it is: addresses that are given out change places.
+
+    Attributes
+    ----------
+    model, serial
+        As it says; "" if it does not.
 
     Raises
     ------
     DriverError
-        viva-genicam is absent, no camera answers at `address`, another program holds it, or it is set to a
-        pixel format that is not plain grey.
+        viva-genicam is absent, no camera answers at `address`, another camera does, another program holds
+        it, or it is set to a pixel format that is not grey.
     """
 
-    def __init__(self, address: str, *, interface: str | None = None, packet_size: int | None = None) -> None:
+    def __init__(
+        self,
+        address: str,
+        *,
+        interface: str | None = None,
+        packet_size: int | None = None,
+        serial: str | None = None,
+    ) -> None:
         try:
             import viva_genicam as viva
         except ImportError as failure:
@@ -140,6 +154,11 @@ class GigeCamera:
             ) from failure
         try:
             self.model = f"{here[0].manufacturer} {here[0].model}"
+            self.serial = self._read_serial()
+            if serial is not None and serial != self.serial:
+                raise DriverError(
+                    f"at {address} is camera '{self.serial}', '{serial}' was wanted: find out its address"
+                )
             self._tick_s = self._read_tick_s()
             self._format = self._camera.get_enum("PixelFormat")
             if self._format not in _GROUPS:
@@ -156,6 +175,14 @@ class GigeCamera:
         except DriverError:
             self.close()
             raise
+
+    def _read_serial(self) -> str:
+        for name in ("DeviceSerialNumber", "DeviceID"):
+            try:
+                return str(self._camera.get_string(name))
+            except self._error:
+                continue
+        return ""
 
     def _read_tick_s(self) -> float:
         for name in ("GevTimestampTickFrequency", "TimestampTickFrequency"):
