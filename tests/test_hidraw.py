@@ -6,6 +6,8 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from ctypes.util import find_library
+from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 
@@ -266,6 +268,51 @@ HidRelay.open().close()
         devices.says("(True, False)")
         devices.says("first")
         devices.do("spacemouse deflect 350 0 0")
+        devices.ends()
+
+
+OTHER_CLIENT = """
+import time, warnings
+warnings.simplefilter("ignore")
+import pyspacemouse
+
+device = pyspacemouse.open()
+print("opened", flush=True)
+before = None
+while before is None or not before[-1][1]:
+    state = device.read()
+    now = [round(value, 3) for value in (state.x, state.y, state.z, state.roll, state.pitch, state.yaw)]
+    now.append(tuple(state.buttons))
+    if now != before:
+        print(now, flush=True)
+    before = now
+"""
+
+
+@needs_umockdev
+@pytest.mark.skipif(
+    find_spec("pyspacemouse") is None or find_library("hidapi-hidraw") is None,
+    reason="pyspacemouse or its libhidapi is not installed",
+)
+def test_pyspacemouse_finds_the_emulated_puck_and_reads_what_was_pushed() -> None:
+    with session(["spacemouse"], OTHER_CLIENT) as devices:
+        devices.says("SpaceMouseCompact found")
+        devices.says("opened")
+        devices.says("[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, (0, 0)]")
+        # Its signs are its own: y and z are the other way round.
+        for pushed, read in (
+            ("350 0 0 0 0 0", "[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, (0, 0)]"),
+            ("0 -175 0 0 0 0", "[0.0, 0.5, 0.0, 0.0, 0.0, 0.0, (0, 0)]"),
+            ("0 0 -70 0 0 0", "[0.0, 0.0, 0.2, 0.0, 0.0, 0.0, (0, 0)]"),
+            ("0 0 0 0 0 350", "[0.0, 0.0, 0.0, 0.0, 0.0, 1.0, (0, 0)]"),
+        ):
+            devices.do("spacemouse deflect 0 0 0", f"spacemouse deflect {pushed}")
+            if pushed[:3] != "350":
+                devices.says("[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, (0, 0)]")
+            devices.says(read)
+        devices.do("spacemouse deflect 0 0 0", "spacemouse press 1")
+        devices.says("[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, (0, 0)]")
+        devices.says("[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, (0, 1)]")
         devices.ends()
 
 
