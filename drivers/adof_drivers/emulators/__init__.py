@@ -1,7 +1,8 @@
 """Devices that speak the real wire formats, so that drivers are proven without hardware.
 
 gige.py       a GigE Vision camera on UDP that serves the pictures it is given, with seeded faults
-hid.py        SpaceMouse, pedal, relay board and DLPC900, as hidapi hands them out
+hid.py        SpaceMouse, pedals, relay board and DLPC900, as hidapi hands them out
+hid_nodes.py  these on /dev/hidraw* under umockdev, for a program that opens them with the real hidapi
 engine.py     what emulated controllers share
 motion.py     motors with finite acceleration, on any clock
 faults.py     what goes wrong with a controller, and when: seeded
