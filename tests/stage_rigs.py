@@ -23,11 +23,12 @@ AXES = {
 
 
 class ManualClock:
-    """Time that passes only when someone waits for it."""
+    """Time that passes only when someone waits for it; what repeats is called as it passes."""
 
     def __init__(self) -> None:
         self._lock = Lock()
         self._now_s = 100.0
+        self._repeated: list[tuple[float, float, Callable[[], bool]]] = []
 
     @property
     def now_s(self) -> float:
@@ -35,7 +36,23 @@ class ManualClock:
 
     def wait(self, duration_s: float) -> None:
         with self._lock:
+            end_s = self._now_s + duration_s
+        while self._repeated and min(self._repeated)[0] <= end_s:
+            due_s, period_s, action = self._repeated.pop(self._repeated.index(min(self._repeated)))
+            with self._lock:
+                self._now_s = max(self._now_s, due_s)
+            if action():
+                self.repeat(action, period_s)
+        with self._lock:
+            self._now_s = max(self._now_s, end_s)
+
+    def hang(self, duration_s: float) -> None:
+        """Let time pass in which the program does nothing."""
+        with self._lock:
             self._now_s += duration_s
+
+    def repeat(self, action: Callable[[], bool], period_s: float) -> None:
+        self._repeated.append((self._now_s + period_s, period_s, action))
 
 
 @contextmanager

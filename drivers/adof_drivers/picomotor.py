@@ -45,6 +45,8 @@ class PicomotorController:
         It does not answer, or not as it should.
     """
 
+    rest_s = None
+
     def __init__(self, link: Link) -> None:
         self._link = link
         self._homed: set[str] = set()
@@ -121,6 +123,10 @@ class PicomotorController:
     def stop(self) -> None:
         """Abort all motion: at once, from any thread."""
         self._link.interrupt(STOP)
+
+    def emergency_stop(self) -> None:
+        """Stop likewise: the drives stay on, or the axes would fall."""
+        self.stop()
 
     def close(self) -> None:
         """Close the link."""

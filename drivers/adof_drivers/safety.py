@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 from typing import Literal
 
@@ -191,31 +191,41 @@ class MotionWatch:
 
     def __init__(self, axes: Mapping[str, StageAxis]) -> None:
         self._axes = axes
+        self._lock = Lock()  # held for arithmetic only: a stop from another thread forgets the courses
         self._courses: dict[str, Course] = {}
         self._runs: dict[str, tuple[float, float]] = {}  # where it began; the way ordered by earlier courses
 
     def begin(self, courses: Mapping[str, Course]) -> None:
         """Follow these commands from now on."""
-        for name, course in courses.items():
-            began, ordered = self._runs.get(name, (course.start, 0.0))
-            before = self._courses.get(name)
-            if before is not None and before.renewed_by(course):
-                ordered += abs(before.at(course.start_s) - before.start)
-            else:
-                began, ordered = course.start, 0.0
-            self._runs[name] = began, ordered
-            self._courses[name] = course
+        with self._lock:
+            for name, course in courses.items():
+                began, ordered = self._runs.get(name, (course.start, 0.0))
+                before = self._courses.get(name)
+                if before is not None and before.renewed_by(course):
+                    ordered += abs(before.at(course.start_s) - before.start)
+                else:
+                    began, ordered = course.start, 0.0
+                self._runs[name] = began, ordered
+                self._courses[name] = course
+
+    def delay(self, name: str, by_s: float) -> None:
+        """Have an axis be later by so much: it stood, because nothing told it to go on."""
+        with self._lock:
+            if (course := self._courses.get(name)) is not None:
+                self._courses[name] = replace(course, start_s=course.start_s + by_s)
 
     def leave(self, names: Collection[str]) -> None:
         """Follow these axes no longer."""
-        for name in names:
-            self._courses.pop(name, None)
-            self._runs.pop(name, None)
+        with self._lock:
+            for name in names:
+                self._courses.pop(name, None)
+                self._runs.pop(name, None)
 
     def forget(self) -> None:
         """Follow nothing: after a stop nobody knows how far an axis has run."""
-        self._courses.clear()
-        self._runs.clear()
+        with self._lock:
+            self._courses.clear()
+            self._runs.clear()
 
     def check(self, time_s: float, position: Mapping[str, float]) -> None:
         """Refuse readings that no command explains.
@@ -225,24 +235,28 @@ class MotionWatch:
         FollowingError
             The message says which axis, where it is and where it ought to be.
         """
-        for name, course in list(self._courses.items()):
-            axis = self._axes[name]
-            soon, late = course.at(time_s), course.at(time_s - axis.lag_s)
-            low, high = min(soon, late) - axis.following, max(soon, late) + axis.following
-            if not low <= position[name] <= high:
-                stands = abs(position[name] - course.start) <= axis.resolution
+        with self._lock:
+            for name, course in self._courses.items():
+                self._check(name, course, time_s, position[name])
+
+    def _check(self, name: str, course: Course, time_s: float, at: float) -> None:
+        axis = self._axes[name]
+        soon, late = course.at(time_s), course.at(time_s - axis.lag_s)
+        low, high = min(soon, late) - axis.following, max(soon, late) + axis.following
+        if not low <= at <= high:
+            stands = abs(at - course.start) <= axis.resolution
+            raise FollowingError(
+                f"{name} {'stands' if stands else 'is'} at {at:.6g} {axis.unit}, where "
+                f"{low:.6g} to {high:.6g} was wanted: "
+                + ("it is stalled, so look for what holds it" if stands else "check load and speed")
+            )
+        began, ordered = self._runs[name]
+        ordered += abs(soon - course.start)
+        gone = math.copysign(1.0, course.target - course.start) * (at - began)
+        if ordered > 2 * (axis.following + course.speed * axis.lag_s):
+            if gone < ordered / 2:
                 raise FollowingError(
-                    f"{name} {'stands' if stands else 'is'} at {position[name]:.6g} {axis.unit}, where "
-                    f"{low:.6g} to {high:.6g} was wanted: "
-                    + ("it is stalled, so look for what holds it" if stands else "check load and speed")
+                    f"{name} stands at {at:.6g} {axis.unit}: of {ordered:.6g} ordered it "
+                    f"went {gone:.6g}; it is stalled, so look for what holds it"
                 )
-            began, ordered = self._runs[name]
-            ordered += abs(soon - course.start)
-            gone = math.copysign(1.0, course.target - course.start) * (position[name] - began)
-            if ordered > 2 * (axis.following + course.speed * axis.lag_s):
-                if gone < ordered / 2:
-                    raise FollowingError(
-                        f"{name} stands at {position[name]:.6g} {axis.unit}: of {ordered:.6g} ordered it "
-                        f"went {gone:.6g}; it is stalled, so look for what holds it"
-                    )
-                self._runs[name] = position[name], -abs(soon - course.start)
+            self._runs[name] = at, -abs(soon - course.start)
