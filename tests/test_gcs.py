@@ -12,35 +12,11 @@ from adof_drivers.emulators.gcs import GcsEngine
 from adof_drivers.errors import DialectError, DriverError, LinkError, StoppedError
 from adof_drivers.gcs import GcsController
 from adof_drivers.link import Link
+from memory_transport import MemoryTransport
 from stage_rigs import ManualClock
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _POSITIONS = re.compile(rf"\s*1=({_NUMBER})\s*\n\s*2=({_NUMBER})\s*\n")
-
-
-class MemoryTransport:
-    """An engine with no wire between; `instead` answers the next line in its place."""
-
-    name = "memory"
-
-    def __init__(self, engine: GcsEngine) -> None:
-        self.engine = engine
-        self._replies = b""
-        self.instead: bytes | None = None
-        self.closed = False
-
-    def write(self, data: bytes) -> None:
-        replies = b"".join(reply.data for reply in self.engine.feed(data))
-        self._replies += replies if self.instead is None else self.instead
-        self.instead = None
-
-    def read_some(self, timeout_s: float) -> bytes:
-        assert timeout_s >= 0
-        piece, self._replies = self._replies[:31], self._replies[31:]
-        return piece
-
-    def close(self) -> None:
-        self.closed = True
 
 
 def opened(**engine: str) -> tuple[GcsController, MemoryTransport]:

@@ -82,7 +82,7 @@ def test_a_good_file_is_read_in_its_order_and_its_own_units(tmp_path: Path) -> N
         ("um_per_unit = 1000.0", 'um_per_unit = "1000"', "um_per_unit"),
         ("speed_limit_um_per_s = 2000.0", "speed_limit_um_per_s = inf", "speed_limit_um_per_s"),
         ("speed_limit_um_per_s = 2000.0", "speed_limit_um_per_s = -1.0", "speed_limit_um_per_s"),
-        ('driver = "gcs"', 'driver = "gsc"', "one of gcs, picomotor"),
+        ('driver = "gcs"', 'driver = "gsc"', "one of gcode, gcs, picomotor"),
         ('driver = "gcs"\n', "", "driver None"),
         ("[stage.coarse]", "[stages.coarse]", "'stages' is no kind"),
         ('tcp = "127.0.0.1:50000"', "", "no port"),
@@ -192,6 +192,28 @@ def test_an_emulator_is_refused_where_others_could_reach_it(
         main(["emulate", "stage", "--tcp", where])
     assert exit_.value.code == 2
     assert capsys.readouterr().err.startswith("adof: ")
+
+
+def test_a_micromanipulator_on_a_terminal_is_opened_by_its_name_and_moves_when_allowed(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("serial")
+    with emulated("--pty", "--protocol", "gcode") as where:
+        text = f"""
+[stage.fine]
+driver = "gcode"
+serial = "{where["address"]}"
+[stage.fine.axes.x]
+wire = "X"
+um_per_unit = 1000.0
+speed_limit_um_per_s = 500.0
+resolution_um = 0.05
+low_um = -3000.0
+high_um = 3000.0
+"""
+        findings = check(load(written(tmp_path, text)), move=True)
+    assert findings[0].found == "micromanipulator v1.0.5"
+    assert [finding.what for finding in findings if not finding.good] == ["axis x"]  # not homed, so not moved
 
 
 def test_an_emulated_stage_on_a_terminal_is_opened_by_its_name(tmp_path: Path) -> None:

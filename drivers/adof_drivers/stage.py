@@ -188,9 +188,11 @@ class Stage:
     _POLL_S = 0.01
     _HORIZON_S = 0.25
     """How far ahead of itself a move is sent: so long it runs on when the program dies."""
+    _RENEW_S = 0.1
     _BLIND_HORIZON_S = 0.1
     """Likewise, where nothing but its end stops what was sent."""
-    _RENEW_S = 0.1
+    _BLIND_RENEW_S = 0.01
+    """A renewal waits for that end first."""
     _BLIND_TIMEOUT_S = 5.0
 
     def __init__(
@@ -206,11 +208,13 @@ class Stage:
         self.latch = latch or EnableLatch()
         self._clock = clock or MonotonicClock()
         self._watch = MotionWatch(self.axes)
+        self._blind = controller.rest_s is not None
+        self._rest_s = controller.rest_s or 0.0
         self._names = {axis.wire: name for name, axis in self.axes.items()}
         self._turn = threading.RLock()  # one command at a time; a stop takes no turn
         self._ways: dict[str, _Way] = {}
         self._renewing = False
-        self._settled = False
+        self._settled = self._resting = False  # at rest; waiting to be
         self._failure: DriverError | None = None  # met by a renewal, for the next question to raise
         try:
             if not axes or len(self._names) != len(self.axes):
@@ -271,7 +275,7 @@ class Stage:
         LinkError, ReplyError
             No answer, or one that makes no sense; likewise.
         """
-        with self._stopped_on_failure():
+        with self._turn, self._stopped_on_failure():
             self._come_to_rest()
             read = self._controller.positions(list(self._names))
             position = {name: read[axis.wire] * axis.scale for name, axis in self.axes.items()}
@@ -298,8 +302,9 @@ class Stage:
         """
         since = self._controller.stops
         self.latch.require()
-        self._come_to_rest()
-        self._controller.enable(list(self._names), since=since)
+        with self._turn:
+            self._come_to_rest()
+            self._controller.enable(list(self._names), since=since)
 
     def home(
         self, axes: Collection[str] | None = None, *, confirm: bool = False, timeout_s: float = 60.0
@@ -321,10 +326,11 @@ class Stage:
                 f"homing {', '.join(names)} drives to the ends of travel: clear the way, then confirm"
             )
         self.latch.require()
-        self._watch.forget()
-        self._ways.clear()
-        self._come_to_rest()
-        self._guarded_home(wires, since, timeout_s)
+        with self._turn:
+            self._watch.forget()
+            self._ways.clear()
+            self._come_to_rest()
+            self._guarded_home(wires, since, timeout_s)
         missing = [self._names[w] for w, known in self._controller.homed(wires).items() if not known]
         if missing:
             raise LimitError(f"{', '.join(missing)} found no reference: look for what is in the way")
@@ -393,7 +399,7 @@ class Stage:
             self._watch_from(since, {name: way.course for name, way in ways.items()})
             if self._ways and not self._renewing:
                 self._renewing = True
-                self._clock.repeat(self._renew, self._RENEW_S)
+                self._clock.repeat(self._renew, self._BLIND_RENEW_S if self._blind else self._RENEW_S)
 
     def set_velocity(self, velocities: Mapping[str, float], *, expires_s: float = 0.25) -> None:
         """Move the named axes at the given velocities for `expires_s`; others go on.
@@ -455,6 +461,11 @@ class Stage:
         with contextlib.suppress(DriverError):
             self._controller.emergency_stop()
 
+    def _trip(self, reason: str) -> None:
+        self.latch.trip(reason)
+        with contextlib.suppress(DriverError):
+            self.stop()
+
     def wait_until_still(self, *, timeout_s: float = 60.0) -> None:
         """Wait until nothing moves, watching that every axis follows.
 
@@ -478,9 +489,7 @@ class Stage:
 
     def close(self) -> None:
         """Stop and let go of the controller; may be called again, never raises over a lost link."""
-        self.latch.trip("it was closed")
-        with contextlib.suppress(DriverError):
-            self.stop()
+        self._trip("it was closed")
         self._controller.close()
 
     def __enter__(self) -> Stage:
@@ -499,8 +508,13 @@ class Stage:
             raise failure
         try:
             yield
+        except StoppedError:
+            raise
         except (FollowingError, LinkError) as failure:
             self.emergency_stop(str(failure))
+            raise
+        except DriverError as failure:
+            self._trip(str(failure))
             raise
 
     def _live_ways(self) -> dict[str, _Way]:
@@ -510,6 +524,8 @@ class Stage:
     def _renew(self) -> bool:
         """Send the next pieces of the moves under way; say whether any is left."""
         with self._turn:
+            if self._resting:  # the same thread waits: nothing may be sent under its eyes
+                return True
             self._renewing = False
             since = self._controller.stops
             self._ways = self._live_ways()
@@ -526,8 +542,7 @@ class Stage:
 
     def _go_on(self, ways: Mapping[str, _Way], position: Mapping[str, float], since: int) -> None:
         """Send axes on from where they are, no further than they come within the horizon."""
-        blind = self._controller.rest_s is not None
-        horizon_s = self._BLIND_HORIZON_S if blind else self._HORIZON_S
+        horizon_s = self._BLIND_HORIZON_S if self._blind else self._HORIZON_S
         now_s = self._clock.now_s
         pieces, left = {}, {}
         for name, way in ways.items():
@@ -556,7 +571,10 @@ class Stage:
             raise
         except DriverError as failure:
             # What was refused may have been half of it: nothing goes on.
-            self.emergency_stop(str(failure))
+            if isinstance(failure, LinkError):
+                self.emergency_stop(str(failure))
+            else:
+                self._trip(str(failure))
             raise
 
     def _watch_from(self, since: int, courses: Mapping[str, Course]) -> None:
@@ -566,11 +584,15 @@ class Stage:
 
     def _come_to_rest(self) -> None:
         """Where a controller says nothing of an axis that moves, wait for the end of what was sent."""
-        if (rest_s := self._controller.rest_s) is None or self._settled:
+        if not self._blind or self._settled:
             return
-        self._wait_while(self._controller.moving, self._BLIND_TIMEOUT_S, "what was sent")
-        self._clock.wait(rest_s)
-        self._settled = True
+        self._resting = True
+        try:
+            self._wait_while(self._controller.moving, self._BLIND_TIMEOUT_S, "what was sent")
+            self._clock.wait(self._rest_s)
+            self._settled = True
+        finally:
+            self._resting = False
 
     def _wait_while(self, busy: Callable[[], bool], timeout_s: float, what: str) -> None:
         deadline_s = self._clock.now_s + timeout_s

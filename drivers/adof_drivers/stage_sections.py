@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
+from adof_drivers.gcode import GcodeController
 from adof_drivers.gcs import GcsController
 from adof_drivers.link import Link, SerialTransport, TcpTransport, Transport, UsbTransport
 from adof_drivers.picomotor import PicomotorController
@@ -213,3 +214,14 @@ class PicomotorSection(StageSection):
     def controller(self, link: Link) -> Controller:
         """Steps."""
         return PicomotorController(link)
+
+
+@register("stage", "gcode")
+class GcodeSection(StageSection):
+    """A MicroManipulatorStepper; units are mm, axes X, Y and Z. They state low and high."""
+
+    ports: ClassVar[Collection[str]] = ("serial", "tcp")
+
+    def controller(self, link: Link) -> Controller:
+        """G-code."""
+        return GcodeController(link)
