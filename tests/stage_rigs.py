@@ -10,9 +10,16 @@ from threading import Lock
 from adof_drivers.emulators.faults import Fault, FaultSchedule
 from adof_drivers.emulators.gcs import GcsEngine
 from adof_drivers.emulators.serve import Served
-from adof_drivers.emulators.usb_bus import UsbBus
+from adof_drivers.emulators.usb_bus import FtdiBus, UsbBus
 from adof_drivers.gcs import GcsController
-from adof_drivers.link import Link, SerialTransport, TcpTransport, Transport, UsbTransport
+from adof_drivers.link import (
+    FtdiTransport,
+    Link,
+    SerialTransport,
+    TcpTransport,
+    Transport,
+    UsbTransport,
+)
 from adof_drivers.safety import StageAxis
 from adof_drivers.stage import Stage
 
@@ -62,6 +69,10 @@ def wired(engine: GcsEngine, wire: str) -> Iterator[Callable[[], Transport]]:
         bus = UsbBus(engine, 0x1A72, 0x1003)
         yield lambda: UsbTransport(0x1A72, backend=bus)
         return
+    if wire == "ftdi":
+        bridge = FtdiBus(engine, 0x1A72, 0x1007)
+        yield lambda: FtdiTransport(0x1A72, 0x1007, backend=bridge)
+        return
     with Served.tcp(engine) if wire == "tcp" else Served.pty(engine) as served:
         yield (
             lambda: (
@@ -85,12 +96,13 @@ def gcs_rig(*faults: Fault, wire: str = "tcp", timeout_s: float = 1.0, ready: bo
     engine = GcsEngine(("1", "2"), now_s=lambda: clock.now_s)
     with ExitStack() as stack:
         connect = stack.enter_context(wired(engine, wire))
-        link = Link(connect(), timeout_s=timeout_s)
+        link = Link(connect())
         stage = stack.enter_context(Stage(GcsController(link), AXES, clock=clock))
         if ready:
             arm(stage)
             stage.enable()
             stage.home(confirm=True)
+        link.timeout_s = timeout_s
         engine.received.clear()
         engine.faults = FaultSchedule(faults)
         yield Rig(clock, engine, link, stage)

@@ -93,6 +93,8 @@ def test_a_good_file_is_read_in_its_order_and_its_own_units(tmp_path: Path) -> N
         ("[stage.coarse]", "[stages.coarse]", "'stages' is no kind"),
         ('tcp = "127.0.0.1:50000"', "", "no port"),
         ('tcp = "127.0.0.1:50000"', 'tcp = "127.0.0.1"', "tcp"),
+        ('tcp = "127.0.0.1:50000"', 'ftdi = "C-863"', "ftdi"),
+        ('tcp = "127.0.0.1:50000"', 'usb = "1a72"\nftdi = "1a72:1007"', "usb and ftdi"),
         ('tcp = "127.0.0.1:50000"', 'tcp = "127.0.0.1:5"\nserial = "/dev/x"', "tcp and serial"),
         ("[stage.coarse]", "[stage.coarse", "no TOML"),
     ],

@@ -50,10 +50,10 @@ def moves(received: list[bytes]) -> list[bytes]:
     return [line for line in received if line.startswith(MOTION)]
 
 
-@pytest.mark.parametrize("wire", ["tcp", "pty", "usb"])
+@pytest.mark.parametrize("wire", ["tcp", "pty", "usb", "ftdi"])
 def test_a_move_arrives_where_it_was_sent_over_every_wire(wire: str) -> None:
-    if wire == "pty":
-        pytest.importorskip("serial")
+    if wire in ("pty", "ftdi"):
+        pytest.importorskip({"pty": "serial", "ftdi": "pyftdi"}[wire])
     with gcs_rig(wire=wire) as rig:
         rig.stage.move_to({"x": 13000.0, "y": 11000.0})
         rig.stage.wait_until_still()

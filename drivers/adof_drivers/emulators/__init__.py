@@ -9,5 +9,5 @@ gcs.py        a PI controller, GCS 2.0
 picomotor.py  a Picomotor 8742
 gcode.py      an open-hardware micromanipulator
 serve.py      an engine behind TCP or a pseudo terminal
-usb_bus.py    an engine behind a pyusb backend
+usb_bus.py    an engine behind a pyusb backend, with or without an FTDI bridge
 """
