@@ -1,8 +1,8 @@
 """A GCS controller on native USB under umockdev, for a child process that opens it with the real libusb.
 
-Run as `umockdev-wrapper /usr/bin/python3 umockdev_gcs.py PYTHON CODE`, with the drivers on PYTHONPATH: the system's
-Python has the bindings, the project's runs the code. When the child prints "unplug" the device is gone from its
-next request on, at "plug" it is back.
+Run as `umockdev-wrapper /usr/bin/python3 umockdev_gcs.py PYTHON CODE`, with the drivers on PYTHONPATH: the
+system's Python has the bindings, the project's runs the code. When the child prints "unplug" the device is
+gone from its next request on, at "plug" it is back.
 """
 
 import errno
