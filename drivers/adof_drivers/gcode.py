@@ -108,6 +108,7 @@ class GcodeController:
 
     rest_s = 0.02
     """Its last step of a segment, 10 ms, runs when it says that it is done."""
+    blind = True
 
     def __init__(self, link: Link) -> None:
         self._link = link

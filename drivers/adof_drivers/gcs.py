@@ -58,6 +58,7 @@ class GcsController:
     """
 
     rest_s = None
+    blind = False
 
     def __init__(self, link: Link, axes: Collection[str] | None = None) -> None:
         self._link = link

@@ -48,10 +48,12 @@ class Controller(Protocol):
 
     @property
     def rest_s(self) -> float | None:
-        """None where an axis can be seen and sent elsewhere in motion; else how long it settles afterwards.
+        """None where axes can be sent elsewhere in motion; else how long they settle before they can."""
+        ...
 
-        Such a controller is asked where it stands, and told to go on, at rest only.
-        """
+    @property
+    def blind(self) -> bool:
+        """Whether it knows where its axes are at rest only; then it has a `rest_s` too."""
         ...
 
     def travel(self, axes: Collection[str]) -> dict[str, tuple[float, float]]:
@@ -189,11 +191,11 @@ class Stage:
     _HORIZON_S = 0.25
     """How far ahead of itself a move is sent: so long it runs on when the program dies."""
     _RENEW_S = 0.1
-    _BLIND_HORIZON_S = 0.1
-    """Likewise, where nothing but its end stops what was sent."""
-    _BLIND_RENEW_S = 0.01
+    _PIECE_S = 0.1
+    """Likewise, where one piece has to end before the next is sent."""
+    _PIECE_RENEW_S = 0.01
     """A renewal waits for that end first."""
-    _BLIND_TIMEOUT_S = 5.0
+    _PIECE_TIMEOUT_S = 5.0
 
     def __init__(
         self,
@@ -208,8 +210,6 @@ class Stage:
         self.latch = latch or EnableLatch()
         self._clock = clock or MonotonicClock()
         self._watch = MotionWatch(self.axes)
-        self._blind = controller.rest_s is not None
-        self._rest_s = controller.rest_s or 0.0
         self._names = {axis.wire: name for name, axis in self.axes.items()}
         self._turn = threading.RLock()  # one command at a time; a stop takes no turn
         self._ways: dict[str, _Way] = {}
@@ -266,7 +266,7 @@ class Stage:
     def position(self) -> dict[str, float]:
         """Read every axis, and compare with what was commanded.
 
-        Where a controller does not know that in motion (`Controller.rest_s`), wait for what was sent to end.
+        Where a controller does not know that in motion (`Controller.blind`), wait for what was sent to end.
 
         Raises
         ------
@@ -276,7 +276,8 @@ class Stage:
             No answer, or one that makes no sense; likewise.
         """
         with self._turn, self._stopped_on_failure():
-            self._come_to_rest()
+            if self._controller.blind:
+                self._come_to_rest()
             read = self._controller.positions(list(self._names))
             position = {name: read[axis.wire] * axis.scale for name, axis in self.axes.items()}
             now_s = self._clock.now_s
@@ -303,7 +304,7 @@ class Stage:
         since = self._controller.stops
         self.latch.require()
         with self._turn:
-            self._come_to_rest()
+            self._rest_before_sending()
             self._controller.enable(list(self._names), since=since)
 
     def home(
@@ -329,7 +330,7 @@ class Stage:
         with self._turn:
             self._watch.forget()
             self._ways.clear()
-            self._come_to_rest()
+            self._rest_before_sending()
             self._guarded_home(wires, since, timeout_s)
         missing = [self._names[w] for w, known in self._controller.homed(wires).items() if not known]
         if missing:
@@ -379,6 +380,7 @@ class Stage:
             return
         with self._turn:
             self._failure = None  # the operator has armed the stage since
+            self._rest_before_sending()
             self._require_homed(targets)
             position = self.position()
             now_s = self._clock.now_s
@@ -399,7 +401,7 @@ class Stage:
             self._watch_from(since, {name: way.course for name, way in ways.items()})
             if self._ways and not self._renewing:
                 self._renewing = True
-                self._clock.repeat(self._renew, self._BLIND_RENEW_S if self._blind else self._RENEW_S)
+                self._clock.repeat(self._renew, self._PIECE_RENEW_S if self._in_pieces else self._RENEW_S)
 
     def set_velocity(self, velocities: Mapping[str, float], *, expires_s: float = 0.25) -> None:
         """Move the named axes at the given velocities for `expires_s`; others go on.
@@ -429,6 +431,8 @@ class Stage:
             return
         with self._turn:
             self._failure = None
+            if any(velocities.values()):  # to halt, none has to rest
+                self._rest_before_sending()
             self._require_homed(velocities)
             position = self.position()
             now_s = self._clock.now_s
@@ -531,6 +535,7 @@ class Stage:
             self._ways = self._live_ways()
             try:
                 if self._ways:
+                    self._rest_before_sending()
                     self._go_on(dict(self._ways), self.position(), since)
             except StoppedError:
                 self._ways.clear()
@@ -542,7 +547,7 @@ class Stage:
 
     def _go_on(self, ways: Mapping[str, _Way], position: Mapping[str, float], since: int) -> None:
         """Send axes on from where they are, no further than they come within the horizon."""
-        horizon_s = self._BLIND_HORIZON_S if self._blind else self._HORIZON_S
+        horizon_s = self._PIECE_S if self._in_pieces else self._HORIZON_S
         now_s = self._clock.now_s
         pieces, left = {}, {}
         for name, way in ways.items():
@@ -582,14 +587,22 @@ class Stage:
         if self._controller.stops != since:
             self._watch.forget()
 
+    @property
+    def _in_pieces(self) -> bool:
+        return self._controller.rest_s is not None
+
+    def _rest_before_sending(self) -> None:
+        with self._stopped_on_failure():
+            self._come_to_rest()
+
     def _come_to_rest(self) -> None:
-        """Where a controller says nothing of an axis that moves, wait for the end of what was sent."""
-        if not self._blind or self._settled:
+        """Where a controller takes nothing new in motion, wait for the end of what was sent."""
+        if (rest_s := self._controller.rest_s) is None or self._settled:
             return
         self._resting = True
         try:
-            self._wait_while(self._controller.moving, self._BLIND_TIMEOUT_S, "what was sent")
-            self._clock.wait(self._rest_s)
+            self._wait_while(self._controller.moving, self._PIECE_TIMEOUT_S, "what was sent")
+            self._clock.wait(rest_s)
             self._settled = True
         finally:
             self._resting = False
