@@ -194,6 +194,32 @@ def test_what_fails_while_nobody_asks_opens_the_latch_and_is_raised_by_the_next_
         rig.stage.wait_until_still()
 
 
+def test_a_latch_opened_by_another_ends_a_long_move_and_is_told_apart_from_an_arrival() -> None:
+    with gcs_rig() as rig:
+        rig.stage.move_to({"x": 20000.0})
+        rig.clock.wait(0.15)
+        rig.stage.latch.trip("the other stage was lost")
+        rig.clock.wait(5.0)
+        assert not rig.engine.moving
+        assert rig.engine.position["1"] < 14.0
+        with pytest.raises(StoppedError, match="the other stage was lost"):
+            rig.stage.wait_until_still()
+
+
+def test_a_wait_that_is_interrupted_ends_the_move() -> None:
+    with gcs_rig() as rig:
+        rig.stage.move_to({"x": 20000.0})
+
+        def interrupted(_duration_s: float) -> None:
+            raise KeyboardInterrupt
+
+        rig.clock.wait, wait = interrupted, rig.clock.wait  # type: ignore[method-assign]
+        with pytest.raises(KeyboardInterrupt):
+            rig.stage.wait_until_still()
+        rig.clock.wait = wait  # type: ignore[method-assign]
+        never_arrives(rig)
+
+
 @pytest.mark.parametrize("kind", ["lose", "garble", "disconnect", "error"])
 def test_a_fault_met_by_a_renewal_leaves_the_stage_at_rest(kind: str) -> None:
     with gcs_rig(wire="usb", timeout_s=0.05) as rig:

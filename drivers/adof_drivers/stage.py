@@ -331,7 +331,7 @@ class Stage:
             self._watch.forget()
             self._ways.clear()
             self._rest_before_sending()
-            self._guarded_home(wires, since, timeout_s)
+        self._guarded_home(wires, since, timeout_s)
         missing = [self._names[w] for w, known in self._controller.homed(wires).items() if not known]
         if missing:
             raise LimitError(f"{', '.join(missing)} found no reference: look for what is in the way")
@@ -479,6 +479,8 @@ class Stage:
             Still moving after `timeout_s`; everything is stopped.
         FollowingError
             An axis is stuck or lost; everything is stopped and the latch open.
+        StoppedError
+            The latch was opened by someone else: it stands short of its target.
         """
 
         def moving() -> bool:
@@ -487,7 +489,7 @@ class Stage:
 
         try:
             self._wait_while(moving, timeout_s, "the motion")
-        except ReplyTimeoutError:
+        except (ReplyTimeoutError, KeyboardInterrupt):
             self.stop()
             raise
 
@@ -534,14 +536,16 @@ class Stage:
             since = self._controller.stops
             self._ways = self._live_ways()
             try:
+                if self._ways and not self.latch.armed:  # opened by another stage, or a pedal
+                    self.stop()
+                    raise StoppedError(f"the move ended short of its target: {self.latch.fault}")
                 if self._ways:
                     self._rest_before_sending()
                     self._go_on(dict(self._ways), self.position(), since)
-            except StoppedError:
-                self._ways.clear()
             except DriverError as failure:
                 self._ways.clear()
-                self._failure = failure
+                if self._controller.stops == since or not self.latch.armed:
+                    self._failure = failure
             self._renewing = bool(self._ways)
             return self._renewing
 
