@@ -22,6 +22,7 @@ from adof_drivers.errors import (
     ControllerError,
     DialectError,
     DriverError,
+    FollowingError,
     LimitError,
     LinkError,
     ReplyTimeoutError,
@@ -194,6 +195,44 @@ def test_nothing_is_answered_while_it_homes_and_the_answer_is_waited_for() -> No
         assert time.monotonic() - began >= 0.15
         assert controller.homed(("X", "Y")) == {"X": True, "Y": True}
         controller.close()
+
+
+@pytest.mark.parametrize("how", ["stop", "emergency_stop"])
+def test_a_stop_while_it_homes_is_not_heard_but_said_and_the_link_stays_in_step(how: str) -> None:
+    engine = GcodeEngine(now_s=time.monotonic, homing_s=0.15)
+    with Served.tcp(engine) as served:
+        controller = GcodeController(Link(TcpTransport("127.0.0.1", served.port)))
+        outcome: list[BaseException] = []
+
+        def home() -> None:
+            try:
+                controller.home((), since=0)
+            except DriverError as failure:
+                outcome.append(failure)
+
+        homing = threading.Thread(target=home)
+        homing.start()
+        while b"G28 A B C" not in engine.received:
+            threading.Event().wait(0.001)
+        getattr(controller, how)()
+        homing.join()
+        assert isinstance(outcome[0], StoppedError)
+        # The ok of M18 is not taken for another's.
+        controller.enable((), since=controller.stops)
+        assert controller.positions(("X", "Y")) == {"X": 0.0, "Y": 0.0}
+        assert not controller.moving()
+        controller.close()
+
+
+def test_a_stuck_axis_is_not_seen_until_the_device_measures() -> None:
+    with rig() as (stage, engine, _clock):
+        engine.motors["X"].stuck = True
+        stage.move_to({"x": 500.0})
+        stage.wait_until_still()
+        assert stage.position()["x"] == pytest.approx(500.0, abs=RESOLUTION_UM)  # where it was sent
+        stage.enable()
+        with pytest.raises(FollowingError, match=r"x stands .* stalled"):
+            stage.position()
 
 
 def test_a_power_cycle_is_found_by_the_next_segment_and_wants_homing() -> None:

@@ -6,7 +6,7 @@ What the device cannot do, and what follows:
   long as the caller lets it run unwatched, and the next at rest; a stop sends nothing more, and what runs
   ends by itself. `emergency_stop` switches the motors off: whatever they hold up falls.
 * Nothing says where it is while it moves, and at rest only where it was sent (M50): an axis that is stuck, or
-  pushed, is not seen. Switched on (M17) it measures, and takes what it finds for its pose.
+  pushed, is not seen. Switched on (M17, `enable`) it measures, and takes what it finds for its pose.
 * While it homes it hears nothing, not even a stop: only its power switch ends that.
 * It knows no limits: axes state their own.
 
