@@ -292,6 +292,27 @@ def test_every_fault_in_a_move_is_a_driver_error_opens_the_latch_and_leaves_it_a
         assert engine.position["X"] <= 0.2 + 1e-6  # two segments at most
 
 
+@given(seed=st.integers(0, 2**32))
+@settings(max_examples=40, deadline=None)
+def test_under_any_faults_a_position_is_the_true_one_or_a_driver_error(seed: int) -> None:
+    kinds = ("lose", "garble", "error", "disconnect", "limit", "power_cycle")
+    with rig() as (stage, engine, clock):
+        stage._controller._link.timeout_s = 0.002  # type: ignore[attr-defined]
+        engine.faults = FaultSchedule.seeded(seed, count=4, lines=60, kinds=kinds)
+        try:
+            for _ in range(6):
+                stage.set_velocity({"x": 800.0, "y": -600.0}, expires_s=0.1)
+                clock.wait(0.05)
+                read, truth = stage.position(), engine.position
+                assert read == pytest.approx({n: truth[n.upper()] * 1e3 for n in AXES}, abs=RESOLUTION_UM)
+        except DriverError:
+            assert not stage.latch.armed
+        clock.wait(1.0)
+        rests_at = engine.position
+        clock.wait(10.0)
+        assert engine.position == rests_at
+
+
 near_misses = st.lists(
     st.sampled_from(
         [b"X", b"Y", b"Z", b"1.500000", b"-0.25", b"1e400", b"nan", b"inf", b" ", b"\n", b"ok\n", b"ok",
