@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import usb.backend.libusb1
 
 from umockdev_there import SYSTEM_PYTHON, umockdev_is_there
 
@@ -54,6 +55,7 @@ again.close()
 
 
 @pytest.mark.skipif(not umockdev_is_there(), reason="umockdev with its Python bindings is not installed")
+@pytest.mark.skipif(usb.backend.libusb1.get_backend() is None, reason="libusb is not installed")
 def test_a_gcs_controller_on_usb_is_driven_stopped_unplugged_and_opened_anew_by_the_real_libusb() -> None:
     script = Path(__file__).with_name("umockdev_gcs.py")
     drivers = Path(__file__).parent.parent / "drivers"
