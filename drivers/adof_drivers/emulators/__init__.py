@@ -8,6 +8,7 @@ motion.py     motors with finite acceleration, on any clock
 faults.py     what goes wrong with a controller, and when: seeded
 gcs.py        a PI controller, GCS 2.0
 picomotor.py  a Picomotor 8742
+gcode.py      an open-hardware micromanipulator
 serve.py      an engine behind TCP or a pseudo terminal
-usb_bus.py    an engine behind a pyusb backend
+usb_bus.py    an engine behind a pyusb backend, with or without an FTDI bridge
 """
