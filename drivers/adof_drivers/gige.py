@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 import struct
 import time
@@ -15,6 +16,9 @@ from adof_drivers.errors import DeviceLostError, DriverError, FrameTimeoutError
 _GREY = {"Mono8": "u1", "Mono10": "<u2", "Mono12": "<u2", "Mono14": "<u2", "Mono16": "<u2"}
 _ASKED = 0.2  # seconds a camera on the same wire gets to answer; they answer within a few ms
 _TRIES = 2
+_CLOCK_CONTROL, _CLOCK_VALUE = 0x944, 0x948  # bootstrap registers: 2 latches the clock into 8 bytes
+_LATCHES = 5
+_LATCHED_EVERY_S = 5.0  # two clocks 100 ppm apart then differ by 0.5 ms at most
 
 
 def answers(address: str, port: int = 3956) -> bool:
@@ -204,6 +208,7 @@ class GigeCamera:
         if self._stream is not None:
             return
         self._clock, self._numbers = DeviceClock(), BlockNumbers()
+        self._ahead_s, self._latched_s = self._latch_s(_LATCHES), time.monotonic()
         try:
             self._stream = self._camera.stream(
                 iface=self._interface,
@@ -216,6 +221,30 @@ class GigeCamera:
             self.stop()
             raise self._failed(failure) from failure
         self._acquiring = True
+
+    def _latch_s(self, tries: int) -> float | None:
+        """How far the host's clock is ahead of the camera's, by the quickest answer; None if it has none."""
+        best_s, ahead_s = math.inf, None
+        for _ in range(tries):
+            try:
+                sent_s = time.monotonic()
+                self._camera.write_register(_CLOCK_CONTROL, b"\0\0\0\2")
+                answered_s = time.monotonic()
+                ticks = int.from_bytes(self._camera.read_register(_CLOCK_VALUE, 8), "big")
+            except self._error:
+                return None
+            if ticks and answered_s - sent_s < best_s:
+                best_s = answered_s - sent_s
+                ahead_s = (sent_s + answered_s) / 2 - ticks * self._tick_s
+        return ahead_s
+
+    def _exposed_s(self, device_s: float, received_s: float) -> float:
+        if self._ahead_s is None:
+            return self._clock.host_s(device_s, received_s)
+        if received_s - self._latched_s > _LATCHED_EVERY_S:
+            self._ahead_s = self._latch_s(1) or self._ahead_s
+            self._latched_s = received_s
+        return device_s + self._ahead_s
 
     def trigger(self) -> None:
         """Expose once; only with `trigger="software"`."""
@@ -273,7 +302,7 @@ class GigeCamera:
         return Frame(
             pixels=pixels,
             number=self._numbers.number(taken.block_id),
-            time_s=received_s if device_s is None else self._clock.host_s(device_s, received_s),
+            time_s=received_s if device_s is None else self._exposed_s(device_s, received_s),
             received_s=received_s,
             device_time_s=device_s,
             complete=taken.is_complete,
