@@ -73,8 +73,8 @@ def test_times_are_of_the_exposure_and_never_after_the_arrival(camera: GigeCamer
     camera.start()
     frames = [camera.grab() for _ in range(20)]
     for frame in frames:
-        # The emulator's clock is the host's, so the carried time shows its error. The clock is latched: it is off
-        # by half a question and answer at most, and a frame's way takes longer than that.
+        # The emulator's clock is the host's, so the carried time shows its error: half of a question and
+        # answer at most, and a frame's way takes longer than that.
         assert frame.device_time_s is not None
         assert abs(frame.time_s - frame.device_time_s) < frame.received_s - frame.device_time_s
         assert frame.time_s <= frame.received_s

@@ -33,6 +33,8 @@ CAMERAS = ("camera.1", "camera.2")
 AXES = {"stage.coarse": ("x", "y", "z", "theta"), "stage.fine": ("x", "y")}
 _DRAWN = Design()
 _LATCH_ASKED_S = 0.05
+_FIRST_PAIR_S = 10.0  # until a client has found out its packets' size and a camera has begun
+_PAIR_S = 2.0
 
 
 class DesignTable(BaseModel):
@@ -114,10 +116,12 @@ class FreshPairs:
         return partner
 
     def _take(self) -> None:
+        timeout_s = _FIRST_PAIR_S
         while not self._closing:
             came: FramePair | DriverError
             try:
-                came = self._pair.grab(self._timeout_s)
+                came = self._pair.grab(timeout_s)
+                timeout_s = self._timeout_s
                 self.pairs += 1
             except DriverError as failure:
                 came = failure
@@ -287,8 +291,9 @@ def opened(sections: Mapping[str, Any], *, instead: Mapping[str, Any] | None = N
                 spacemouse=operators.get("spacemouse"),
             )
         )
+        timeout_s = max(_PAIR_S, 5 * period_s)
         pairs = stack.enter_context(
-            FreshPairs(pair, operator.latch, exposure_s=design.exposure_s, timeout_s=max(1.0, 5 * period_s))
+            FreshPairs(pair, operator.latch, exposure_s=design.exposure_s, timeout_s=timeout_s)
         )
         yield LiveRig(
             design=design,

@@ -18,7 +18,8 @@ _ASKED = 0.2  # seconds a camera on the same wire gets to answer; they answer wi
 _TRIES = 2
 _CLOCK_CONTROL, _CLOCK_VALUE = 0x944, 0x948  # bootstrap registers: 2 latches the clock into 8 bytes
 _LATCHES = 5
-_LATCHED_EVERY_S = 5.0  # two clocks 100 ppm apart then differ by 0.5 ms at most
+_LATCHED_EVERY_S = 5.0
+_DRIFT = 1e-4  # of one quartz against another
 
 
 def answers(address: str, port: int = 3956) -> bool:
@@ -208,7 +209,8 @@ class GigeCamera:
         if self._stream is not None:
             return
         self._clock, self._numbers = DeviceClock(), BlockNumbers()
-        self._ahead_s, self._latched_s = self._latch_s(_LATCHES), time.monotonic()
+        self._ahead_s, self._doubt_s = self._latch_s(_LATCHES)
+        self._latched_s = self._asked_s = time.monotonic()
         try:
             self._stream = self._camera.stream(
                 iface=self._interface,
@@ -222,9 +224,12 @@ class GigeCamera:
             raise self._failed(failure) from failure
         self._acquiring = True
 
-    def _latch_s(self, tries: int) -> float | None:
-        """How far the host's clock is ahead of the camera's, by the quickest answer; None if it has none."""
-        best_s, ahead_s = math.inf, None
+    def _latch_s(self, tries: int) -> tuple[float | None, float]:
+        """How far the host's clock is ahead of the camera's, None if it has none to latch; and how far off.
+
+        A question and its answer took the time they took: the moment between them is known to half of it.
+        """
+        doubt_s, ahead_s = math.inf, None
         for _ in range(tries):
             try:
                 sent_s = time.monotonic()
@@ -232,18 +237,21 @@ class GigeCamera:
                 answered_s = time.monotonic()
                 ticks = int.from_bytes(self._camera.read_register(_CLOCK_VALUE, 8), "big")
             except self._error:
-                return None
-            if ticks and answered_s - sent_s < best_s:
-                best_s = answered_s - sent_s
+                return None, math.inf
+            if ticks and (answered_s - sent_s) / 2 < doubt_s:
+                doubt_s = (answered_s - sent_s) / 2
                 ahead_s = (sent_s + answered_s) / 2 - ticks * self._tick_s
-        return ahead_s
+        return ahead_s, doubt_s
 
     def _exposed_s(self, device_s: float, received_s: float) -> float:
         if self._ahead_s is None:
             return self._clock.host_s(device_s, received_s)
-        if received_s - self._latched_s > _LATCHED_EVERY_S:
-            self._ahead_s = self._latch_s(1) or self._ahead_s
-            self._latched_s = received_s
+        if received_s - self._asked_s > _LATCHED_EVERY_S:
+            self._asked_s = received_s
+            ahead_s, doubt_s = self._latch_s(1)
+            # A slow answer may know less than the last good one, drifting since.
+            if ahead_s is not None and doubt_s < self._doubt_s + _DRIFT * (received_s - self._latched_s):
+                self._ahead_s, self._doubt_s, self._latched_s = ahead_s, doubt_s, received_s
         return device_s + self._ahead_s
 
     def trigger(self) -> None:

@@ -81,18 +81,22 @@ class Operator:
         self.latch.operator(False)
         self.latch.operator(True)
 
+    def look(self) -> None:
+        """Ask pedal and SpaceMouse once, and act; the thread does this all the time."""
+        if self._pedal is not None:
+            self._pedal_pressed = self._pedal.poll().stop
+            # While it says stop the latch cannot be closed, whatever is pressed.
+            if self._pedal_pressed and self.latch.armed:
+                for stage in self._stages.values():
+                    stage.emergency_stop(_DOUBT)
+                self.stopped_s = time.monotonic()
+        if self._mouse is not None:
+            self._jog = self._mouse.poll()
+            self.latch.operator(ENABLE in self._jog.buttons and not self._pedal_pressed)
+
     def _watch(self) -> None:
         while not self._closing.wait(PERIOD_S):
-            if self._pedal is not None:
-                self._pedal_pressed = self._pedal.poll().stop
-                # While it says stop the latch cannot be closed, whatever is pressed.
-                if self._pedal_pressed and self.latch.armed:
-                    for stage in self._stages.values():
-                        stage.emergency_stop(_DOUBT)
-                    self.stopped_s = time.monotonic()
-            if self._mouse is not None:
-                self._jog = self._mouse.poll()
-                self.latch.operator(ENABLE in self._jog.buttons and not self._pedal_pressed)
+            self.look()
 
     def wait_for_start(
         self,
