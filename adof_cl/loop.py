@@ -79,6 +79,7 @@ class Stage(Protocol):
     @property
     def speed_limits(self) -> Mapping[str, float]: ...  # noqa: D102
     def position(self) -> Mapping[str, float]: ...  # noqa: D102
+    def position_at(self, time_s: float) -> Mapping[str, float]: ...  # noqa: D102
     def move_to(self, targets: Mapping[str, float], *, speed: float | None = None) -> None: ...  # noqa: D102
     def stop(self) -> None: ...  # noqa: D102
     def wait_until_still(self) -> None: ...  # noqa: D102
@@ -397,7 +398,6 @@ class Assembly:
         self._last_move_um = np.zeros(3)
         self._features: dict[str, tuple[int, int]] = {}
         self._last_frame_s: dict[int, float] = {}
-        self._last_z: tuple[float, float] | None = None
         self._depth_offset_um, self._frames_fused = 0.0, 0
 
     # ---- the whole run ------------------------------------------------------------------------------------
@@ -878,8 +878,8 @@ class Assembly:
         assert self.stereo is not None
         frames = self.look()
         begun = time.perf_counter()
-        # Where the stage stands when the frames are here, not when they have been worked on.
-        reading = self.rig.coarse.position()
+        # Where the stage stood in the picture: by now it may be farther on.
+        reading = self.rig.coarse.position_at(frames[0].time_s)
         age_s = self.rig.clock.now_s - (frames[0].time_s + self.design.exposure_s / 2)
         self._turn_templates(reading["theta"])
         for eye, frame in zip(self.eyes, frames, strict=True):
@@ -910,7 +910,7 @@ class Assembly:
             )
         if not blind:
             self.world[HOLE] = self.world[PEG] + fix.xyz_um
-            self._require_agreement(reading, age_s)
+            self._require_agreement(reading)
         block = self.stereo.camera_1.matrix_px_per_um[:, :2]
         peg, hole = seen[0][PEG], seen[0][HOLE]
         desired = self._desired(block, peg)
@@ -923,6 +923,7 @@ class Assembly:
             begun=begun,
             seen=time.perf_counter(),
             age_s=age_s,
+            stage_z_um=float(reading["z"]),
             frame=frames[0],
             hole_px=hole.xy_px,
             desired_px=desired,
@@ -963,16 +964,12 @@ class Assembly:
         The stage's steps are a thirtieth of one frame's depth noise: a running mean of what vision says of
         the stage's zero is better than the last frame.
         """
-        now_s, z_um = self.rig.clock.now_s, float(self.rig.coarse.position()["z"])
-        last_s, last_um = self._last_z or (now_s, z_um)
-        speed = (z_um - last_um) / (now_s - last_s) if now_s > last_s else 0.0
-        self._last_z = now_s, z_um
         self._frames_fused = min(self._frames_fused + 1, _FUSED_FRAMES)
-        offset = sight.depth_um - (z_um - speed * (now_s - sight.frame.time_s))
+        offset = sight.depth_um - sight.stage_z_um
         self._depth_offset_um += (offset - self._depth_offset_um) / self._frames_fused
-        return self._depth_offset_um + z_um
+        return self._depth_offset_um + float(self.rig.coarse.position()["z"])
 
-    def _require_agreement(self, reading: Mapping[str, float], age_s: float) -> None:
+    def _require_agreement(self, reading: Mapping[str, float]) -> None:
         """Refuse to go on when vision and stage tell different stories of where the hole is.
 
         Raises
@@ -982,13 +979,10 @@ class Assembly:
             exposure can explain.
         """
         apart = float(np.linalg.norm(self.world[HOLE] - self._hole_world(reading)))
-        # An old frame shows where the hole was before it moved on.
-        speed = math.hypot(*(self.rig.coarse.speed_limits[axis] for axis in ("x", "y", "z")))
-        allowed = _DISAGREEMENT_UM + speed * max(age_s, 0.0)
-        if apart > allowed:
+        if apart > _DISAGREEMENT_UM:
             raise TrackingError(
                 f"the hole is seen {apart:.0f} um from where its stage says it is, at most "
-                f"{allowed:.0f} was wanted: check cameras and stage, then start again"
+                f"{_DISAGREEMENT_UM:.0f} was wanted: check cameras and stage, then start again"
             )
 
     def _desired(self, block: Array, peg: Features) -> Array:
@@ -1075,6 +1069,7 @@ class _Sight:
     begun: float
     seen: float
     age_s: float
+    stage_z_um: float
     frame: Frame
     hole_px: Array
     desired_px: Array

@@ -18,6 +18,7 @@ from adof_cl.errors import InputError
 from adof_cl.optics import OpticalSystem, SlmPanel
 from adof_cl.record import RunRecord
 from adof_cl.twin.design import Design, HolePlate, Peg
+from adof_cl.twin.recorded import RecordedAxis
 from adof_drivers.camera import WatchedCamera
 from adof_drivers.camera_pair import CameraPair, FramePair
 from adof_drivers.camera_sections import SensorSection
@@ -33,6 +34,7 @@ CAMERAS = ("camera.1", "camera.2")
 AXES = {"stage.coarse": ("x", "y", "z", "theta"), "stage.fine": ("x", "y")}
 _DRAWN = Design()
 _LATCH_ASKED_S = 0.05
+_FOLLOWED_S = 0.004
 _FIRST_PAIR_S = 10.0  # until a client has found out its packets' size and a camera has begun
 _PAIR_S = 2.0
 
@@ -159,6 +161,72 @@ class LiveCamera:
         return self.pairs.first() if self.number == 1 else self.pairs.second()
 
 
+class FollowedStage:
+    """A stage whose axes are read all the time, so that it can say where it was when a frame was exposed.
+
+    Every other word is the stage's own. A context.
+    """
+
+    def __init__(self, stage: Stage) -> None:
+        self.stage = stage
+        now_s = time.monotonic()
+        self._axes = {name: RecordedAxis(now_s, value) for name, value in stage.position().items()}
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._follow, name="positions", daemon=True)
+
+    def __enter__(self) -> FollowedStage:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._closing.set()
+        self._thread.join()
+
+    def _follow(self) -> None:
+        pause_s = _FOLLOWED_S
+        while not self._closing.wait(pause_s):
+            asked_s = time.monotonic()
+            try:
+                position = self.stage.position()
+            except DriverError:
+                return  # it is stopped; whoever asks next is told why
+            answered_s = time.monotonic()
+            for name, value in position.items():
+                self._axes[name].add((asked_s + answered_s) / 2, value)
+            # A slow line is left to the commands for most of the time.
+            pause_s = max(_FOLLOWED_S, 3 * (answered_s - asked_s))
+
+    def position_at(self, time_s: float) -> dict[str, float]:
+        """Return where every axis was, straight on between two readings."""
+        return {name: float(axis.at(time_s)) for name, axis in self._axes.items()}
+
+    @property
+    def resolution(self) -> dict[str, float]:
+        """Smallest step of each axis."""
+        return self.stage.resolution
+
+    @property
+    def speed_limits(self) -> dict[str, float]:
+        """Fastest speed of each axis."""
+        return self.stage.speed_limits
+
+    def position(self) -> dict[str, float]:
+        """Read every axis."""
+        return self.stage.position()
+
+    def move_to(self, targets: Mapping[str, float], *, speed: float | None = None) -> None:
+        """Leave for the given positions."""
+        self.stage.move_to(targets, speed=speed)
+
+    def stop(self) -> None:
+        """Bring every axis to rest."""
+        self.stage.stop()
+
+    def wait_until_still(self) -> None:
+        """Wait until nothing moves."""
+        self.stage.wait_until_still()
+
+
 @dataclass(frozen=True)
 class LiveRig:
     """What the loop drives, and how it was drawn."""
@@ -167,8 +235,8 @@ class LiveRig:
     camera_1: LiveCamera
     camera_2: LiveCamera
     slm: Slm
-    coarse: Stage
-    fine: Stage
+    coarse: FollowedStage
+    fine: FollowedStage
     clock: MonotonicClock
     operator: Operator
     watched: tuple[WatchedCamera, WatchedCamera]
@@ -177,7 +245,7 @@ class LiveRig:
 
     def home(self) -> None:
         """Let every axis that has to find its reference, the coarse stage's depth first."""
-        for stage in (self.coarse, self.fine):
+        for stage in (self.coarse.stage, self.fine.stage):
             stage.enable()
             lost = [name for name, known in stage.homed().items() if not known]
             for first in ([name for name in lost if name == "z"], [name for name in lost if name != "z"]):
@@ -300,8 +368,8 @@ def opened(sections: Mapping[str, Any], *, instead: Mapping[str, Any] | None = N
             camera_1=LiveCamera(1, pairs),
             camera_2=LiveCamera(2, pairs),
             slm=held["slm"],
-            coarse=coarse,
-            fine=fine,
+            coarse=stack.enter_context(FollowedStage(coarse)),
+            fine=stack.enter_context(FollowedStage(fine)),
             clock=MonotonicClock(),
             operator=operator,
             watched=watched,
@@ -337,7 +405,7 @@ def start(
     def ready() -> None:
         if home:
             rig.home()
-        for stage in (rig.coarse, rig.fine):
+        for stage in (rig.coarse.stage, rig.fine.stage):
             stage.enable()
             if lost := [name for name, known in stage.homed().items() if not known]:
                 raise InputError(
@@ -355,7 +423,7 @@ def start(
         return
     tell("operator", "SpaceMouse: first button enables, the puck jogs, second button starts")
     jogged = rig.operator.wait_for_start(
-        rig.coarse,
+        rig.coarse.stage,
         speed_um_per_s=puck.jog_speed_um_per_s,
         speed_rad_per_s=puck.jog_speed_rad_per_s,
         ready=ready,

@@ -236,7 +236,9 @@ class MotionWatch:
                     f"{low:.6g} to {high:.6g} was wanted: "
                     + ("it is stalled, so look for what holds it" if stands else "check load and speed")
                 )
-            began, ordered = self._runs[name]
+            if (run := self._runs.get(name)) is None:
+                continue  # a stop in another thread came meanwhile
+            began, ordered = run
             ordered += abs(soon - course.start)
             gone = math.copysign(1.0, course.target - course.start) * (position[name] - began)
             if ordered > 2 * (axis.following + course.speed * axis.lag_s):
