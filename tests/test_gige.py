@@ -85,9 +85,11 @@ def test_times_are_of_the_exposure_and_never_after_the_arrival(camera: GigeCamer
     camera.start()
     frames = [camera.grab() for _ in range(20)]
     for frame in frames:
-        # The emulator's clock is the host's, so the carried time shows its error: how long the quickest took.
+        # The emulator's clock is the host's, so the carried time shows its error: half of a question and
+        # answer at most, and a frame's way takes longer than that.
         assert frame.device_time_s is not None
-        assert frame.device_time_s <= frame.time_s <= frame.received_s
+        assert abs(frame.time_s - frame.device_time_s) < frame.received_s - frame.device_time_s
+        assert frame.time_s <= frame.received_s
     apart_s = np.diff([frame.time_s for frame in frames])
     numbers = np.diff([frame.number for frame in frames])
     assert (numbers >= 1).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 import struct
 import time
@@ -20,6 +21,10 @@ _GROUPS = {"Mono8": (1, 1), **dict.fromkeys(("Mono10", "Mono12", "Mono14", "Mono
 _ASKED = 0.2  # seconds a camera on the same wire gets to answer; they answer within a few ms
 _TRIES = 2
 _LARGEST_BUFFER = Path("/proc/sys/net/core/rmem_max")
+_CLOCK_CONTROL, _CLOCK_VALUE = 0x944, 0x948  # bootstrap registers: 2 latches the clock into 8 bytes
+_LATCHES = 5
+_LATCHED_EVERY_S = 5.0
+_DRIFT = 1e-4  # of one quartz against another
 
 
 def buffer_advice(frame_bytes: int) -> str | None:
@@ -263,6 +268,8 @@ class GigeCamera:
         (rows, columns), (pixels, size) = self.shape, _GROUPS[self._format]
         if advice := buffer_advice(rows * columns * size // pixels):
             warnings.warn(advice, stacklevel=2)
+        self._ahead_s, self._doubt_s = self._latch_s(_LATCHES)
+        self._latched_s = self._asked_s = time.monotonic()
         try:
             self._stream = self._camera.stream(
                 iface=self._interface,
@@ -275,6 +282,36 @@ class GigeCamera:
             self.stop()
             raise self._failed(failure) from failure
         self._acquiring = True
+
+    def _latch_s(self, tries: int) -> tuple[float | None, float]:
+        """How far the host's clock is ahead of the camera's, None if it has none to latch; and how far off.
+
+        A question and its answer took the time they took: the moment between them is known to half of it.
+        """
+        doubt_s, ahead_s = math.inf, None
+        for _ in range(tries):
+            try:
+                sent_s = time.monotonic()
+                self._camera.write_register(_CLOCK_CONTROL, b"\0\0\0\2")
+                answered_s = time.monotonic()
+                ticks = int.from_bytes(self._camera.read_register(_CLOCK_VALUE, 8), "big")
+            except self._error:
+                return None, math.inf
+            if ticks and (answered_s - sent_s) / 2 < doubt_s:
+                doubt_s = (answered_s - sent_s) / 2
+                ahead_s = (sent_s + answered_s) / 2 - ticks * self._tick_s
+        return ahead_s, doubt_s
+
+    def _exposed_s(self, device_s: float, received_s: float) -> float:
+        if self._ahead_s is None:
+            return self._clock.host_s(device_s, received_s)
+        if received_s - self._asked_s > _LATCHED_EVERY_S:
+            self._asked_s = received_s
+            ahead_s, doubt_s = self._latch_s(1)
+            # A slow answer may know less than the last good one, drifting since.
+            if ahead_s is not None and doubt_s < self._doubt_s + _DRIFT * (received_s - self._latched_s):
+                self._ahead_s, self._doubt_s, self._latched_s = ahead_s, doubt_s, received_s
+        return device_s + self._ahead_s
 
     def trigger(self) -> None:
         """Expose once; only with `trigger="software"`."""
@@ -323,7 +360,7 @@ class GigeCamera:
             number=self._numbers.number(taken.block_id, believed=complete),
             time_s=received_s
             if device_s is None or not complete
-            else self._clock.host_s(device_s, received_s),
+            else self._exposed_s(device_s, received_s),
             received_s=received_s,
             device_time_s=device_s,
             complete=complete,

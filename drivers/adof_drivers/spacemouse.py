@@ -93,9 +93,9 @@ class SpaceMouse:
         self._heard_s = [opened_s, opened_s]  # of the first three axes, of the last three
 
     @classmethod
-    def open(cls, path: str | None = None) -> SpaceMouse:
+    def open(cls, path: str | None = None, *, dead_zone: float = 0.05) -> SpaceMouse:
         """Find and open the only one, or the one at `path`."""
-        return cls(open_hid("SpaceMouse", IDENTITIES, path=path))
+        return cls(open_hid("SpaceMouse", IDENTITIES, path=path), dead_zone=dead_zone)
 
     def poll(self) -> JogState:
         """Return the wish of now; never waits, never raises."""

@@ -167,6 +167,56 @@ def _reached(limit: int | None, number: int) -> bool:
     return limit is not None and number >= limit
 
 
+class TriggerLine:
+    """One wire that triggers several cameras: at each pulse all of them expose, so that they keep step.
+
+    While one is still busy with its last exposure the pulse waits, for whole periods of the cameras' rate.
+    """
+
+    def __init__(self) -> None:
+        self._condition = threading.Condition()
+        self._seen: dict[object, int] = {}  # by camera, the last pulse it exposed at
+        self._ready: set[object] = set()
+        self._period_s = 0.0
+        self._pulses = 0
+        self.moment_s = 0.0
+
+    def leave(self, camera: object) -> None:
+        """Wait for this camera no longer: it does not acquire."""
+        with self._condition:
+            self._seen.pop(camera, None)
+            self._ready.discard(camera)
+            self._pulse()
+
+    def wait(self, camera: object, period_s: float, timeout_s: float) -> float | None:
+        """Be ready for a pulse; return its moment, which may lie ahead, or None after the time-out."""
+        with self._condition:
+            seen = self._seen.setdefault(camera, self._pulses)
+            if seen == self._pulses:
+                self._period_s = period_s
+                self._ready.add(camera)
+                self._pulse()
+            if not self._condition.wait_for(lambda: self._pulses != seen, timeout_s):
+                return None
+            self._seen[camera] = self._pulses
+            return self.moment_s
+
+    def _pulse(self) -> None:
+        if self._ready and self._ready == self._seen.keys():
+            self.moment_s = _next_moment_s(self.moment_s, self._period_s)
+            self._ready.clear()
+            self._pulses += 1
+            self._condition.notify_all()
+
+
+def _next_moment_s(last_s: float, period_s: float) -> float:
+    """When to expose next: free-running cameras of one rate keep step, as if one clock triggered them.
+
+    A moment may begin late by up to a period; later ones are not made up for.
+    """
+    return period_s * max(round(last_s / period_s) + 1, math.floor(time.monotonic() / period_s))
+
+
 @dataclass(frozen=True)
 class _Block:
     """A frame cut into packets, kept for those who ask again."""
@@ -197,6 +247,8 @@ class GigeCameraEmulator:
         Bytes after each line, as cameras send that align their lines.
     faults
         What goes wrong.
+    line
+        Triggers it instead of its own clock; the rate is still its own.
 
     Attributes
     ----------
@@ -222,6 +274,7 @@ class GigeCameraEmulator:
         exposure_us: float = 5000.0,
         line_padding: int = 0,
         faults: Faults | None = None,
+        line: TriggerLine | None = None,
     ) -> None:
         if not 0 < rate_hz < math.inf:
             raise DriverError(f"rate_hz is {rate_hz}: a rate above 0 was wanted")
@@ -244,6 +297,7 @@ class GigeCameraEmulator:
         self.failure: BaseException | None = None
         self._siblings = tuple(siblings)
         self._faults = faults or Faults()
+        self._line = line
         self._memory = _memory(address, sensor, pixel_format, rate_hz, exposure_us, line_padding)
         self._controller: tuple[str, int] | None = None
         self._heard_s = 0.0
@@ -492,6 +546,8 @@ class GigeCameraEmulator:
         while not self._closing.is_set():
             if not self._acquiring.is_set():
                 block, held, begun_s = 0, None, time.monotonic()
+                if self._line is not None:
+                    self._line.leave(self)
                 self._acquiring.wait(0.05)
                 continue
             if self._get(TRIGGER_MODE):
@@ -499,7 +555,14 @@ class GigeCameraEmulator:
                     continue
                 begun_s = time.monotonic()
             else:
-                begun_s = self._next_moment_s(begun_s)
+                period_s = 1 / self._get_float(FRAME_RATE_HZ)
+                if self._line is None:
+                    begun_s = _next_moment_s(begun_s, period_s)
+                else:
+                    moment_s = self._line.wait(self, period_s, 0.05)
+                    if moment_s is None:
+                        continue
+                    begun_s = moment_s
                 left_s = begun_s - time.monotonic()
                 if left_s > 0 and self._closing.wait(left_s):
                     return
@@ -533,14 +596,6 @@ class GigeCameraEmulator:
                 if one is not None:
                     self._transmit(one, draw)
             held = None
-
-    def _next_moment_s(self, last_s: float) -> float:
-        """When to expose next: free-running cameras of one rate keep step, as if one clock triggered them.
-
-        A moment may begin late by up to a period; later ones are not made up for.
-        """
-        period_s = 1 / self._get_float(FRAME_RATE_HZ)
-        return period_s * max(round(last_s / period_s) + 1, math.floor(time.monotonic() / period_s))
 
     def _expose(self, number: int) -> NDArray[Any]:
         shape = (self._get(HEIGHT), self._get(WIDTH))
