@@ -22,6 +22,7 @@ from adof_cl.errors import AdofError
 from adof_cl.noise import noise_to_signal
 from adof_cl.optics import Mask, OpticalSystem, PupilGrid
 from adof_cl.otf import Otf1d
+from adof_cl.program import Program
 from adof_cl.pupil_phase import PupilPhase
 from adof_cl.restore import Restore
 from adof_cl.servo import require_stable_gain, samples_late, stability_limit_per_s
@@ -408,6 +409,54 @@ def _restore_frames(device: Device, storage: str, full: bool) -> Iterator[Point]
                 yield _refusal(f"{value:g}", plan.restore, spoilt)
 
 
+_DENORMALS = """\
+__kernel void denormals(__global const float *least, __global const float *below, __global float *made,
+                        __global float *taken, __global half *stored, __global float *loaded)
+{
+    const int i = get_global_id(0);
+    made[i] = 0.5f * least[i];
+    taken[i] = 16777216.0f * below[i];
+    vstore_half(ldexp(least[i], 126 - 15), i, stored);
+    loaded[i] = vload_half(i, stored);
+}
+"""
+
+
+def _denormals(device: Device, storage: str, full: bool) -> Iterator[Point]:
+    """Numbers below the least normal one, as programs are built and with the option that lets them be 0."""
+    shape = (127, 251) if full else (24, 20)
+    share = np.linspace(1, 2, 64, endpoint=False, dtype=np.float32)
+    least = share * np.float32(_FLOAT_LEAST)
+    for option in ((), ("-cl-denorms-are-zero",)):
+        own = Device(device.facts, device.handle)
+        own.build_options = option
+        made, taken, loaded = (own.empty(share.shape, np.float32) for _ in range(3))
+        below, stored = own.upload(least / 2), own.empty(share.shape, np.float16)
+        program = Program(own, "precision.h", generated=("denormals.cl", _DENORMALS))
+        program.launch(
+            "denormals", share.shape, None, own.upload(least), below, made, taken, stored, loaded
+        )()
+        name = option[0] if option else "as built"
+        results = (
+            [("a half", loaded, share * 2.0**-15, _HALF_LEAST)]
+            if storage == "half"
+            else [
+                ("a result", made, share.astype(np.float64) * _FLOAT_LEAST / 2, _FLOAT_LEAST),
+                ("an operand", taken, share * 2.0**-103, 2.0**-102),
+            ]
+        )
+        for what, found, wanted, unit in results:
+            values = found.download().astype(np.float64)
+            kept = "kept" if (values != 0).all() else "0"
+            yield _answer(f"{name}: {what} is {kept}", (values - wanted) / unit, 1.0)
+        plan = _plan(own, shape, storage)
+        axes = _coded_axes(plan.padded_shape, storage)
+        frame = np.zeros(shape, plan.in_dtype)
+        faint = 1 if storage == "half" else _FLOAT_LEAST / 4
+        frame[::2, ::3] = faint
+        yield _restored(plan, f"{name}: a frame of {faint:.2g}", frame, axes, 0.05)
+
+
 def _psf(device: Device, storage: str, full: bool) -> Iterator[Point]:
     del device, storage
     shape = (64, 48) if full else (24, 18)
@@ -534,8 +583,8 @@ class Walked:
 
 
 _SHIFT_PX = 0.8
-# Where image and template agree, a step of Gauss-Newton leaves the square of what it mended times half the ratio
-# of the second slope to the first, 2 pi/6 a pixel in this texture; the last step mends less than 1e-4 px.
+# Where image and template agree, a step of Gauss-Newton leaves the square of what it mended times half the
+# ratio of the second slope to the first, 2 pi/6 a pixel in this texture; the last mends less than 1e-4 px.
 _EXACT_PX = 1e-8
 
 
@@ -605,15 +654,15 @@ def _tracking(device: Device, storage: str, full: bool) -> Iterator[Point]:
     steps = np.array([[0, 0], [3, 1], [5, -2], [1, -3], [0, 0], [0, 0]])
     frames = [device.upload(np.roll(image, (dy, dx), (0, 1))) for dx, dy in steps]
     tracker.aim(truths)
-    laps, before = 20 if full else 3, None
-    for _ in range(laps):
-        places = np.array([[m.feature_xy_px for m in tracker.track(frame)] for frame in frames])
-        # What is remembered are two places; the same two at the same frame make every later lap this one.
-        if before is not None:
-            yield _answer("a lap after a lap", places - before, 0.0)
-        before = places
-    assert before is not None
-    yield _answer("after the last lap", before - (truths + steps[:, None, :]), _EXACT_PX)
+    # What is remembered are two places; the same two at the same frame make every later lap the one before.
+    laps = np.array(
+        [
+            [[m.feature_xy_px for m in tracker.track(frame)] for frame in frames]
+            for _ in range(20 if full else 3)
+        ]
+    )
+    yield _answer("a lap after a lap", np.diff(laps, axis=0), 0.0)
+    yield _answer("after the last lap", laps[-1] - (truths + steps[:, None, :]), _EXACT_PX)
 
     for walked in walk(device, 20000, 100, grid=3 if full else 2):
         if not walked.unseen:
@@ -730,6 +779,12 @@ ROWS: tuple[Row, ...] = (
         "as restore-nsr; in halves 2^-11 and the largest gain of a line, for a flat frame's roundings agree; "
         "a number below 2^-126 (halves 2^-14) may become 0",
         "relative L2; integers: rms of range", "frame", _restore_frames, STORAGES,
+    ),
+    Row(
+        "denormals", "float32 below 2^-126, halves below 2^-14; built as ever and with -cl-denorms-are-zero",
+        "kept or 0, and the image within the bound", "nothing",
+        "a number turned 0 was below the least normal one; images as restore-frames",
+        "least normal numbers; images: as restore-frames", "case", _denormals, ("float32", "half"),
     ),
     Row(
         "psf", "a delta, a full frame, some negative values, any unit", "OTF within the bound",

@@ -132,6 +132,15 @@ def markdown(facts: DeviceFacts, outcomes: list[Outcome]) -> str:
             f"| {outcome.row.name} | {outcome.storage} | {len(outcome.points)} | {outcome.refusals} | "
             f"{_cell(outcome.row.measure)} | {numbers} | {'yes' if outcome.ok else '**no**'} |"
         )
+    cases = [
+        f"| {outcome.row.name} | {outcome.storage} | {_cell(_place(p.at))} | {p.error:.1e} | {p.bound:.1e} |"
+        for outcome in outcomes
+        if outcome.row.axis == "case"
+        for p in outcome.points
+        if not p.refused
+    ]
+    if cases:
+        lines += ["", "| row | in | case | error | its bound |", "|---|---|---|---|---|", *cases]
     return "\n".join(lines) + "\n"
 
 
