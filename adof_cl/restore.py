@@ -23,6 +23,7 @@ from adof_cl.errors import InputError, LimitError
 from adof_cl.fft_passes import Passes, pass_lists
 from adof_cl.finite import require_transfer
 from adof_cl.noise import NSR_LIMIT, checked_nsr
+from adof_cl.optics import require_whole
 from adof_cl.padding import checked_frame_shape, padded_shape, padding_weights
 from adof_cl.program import Argument, Launch, Program, vector_bytes
 
@@ -555,16 +556,27 @@ class Restore:
 
         Lines of the outer axis' other frequencies than 0 count half: the mean of a line of pixels from 0 to p
         times a turning unit is at most p/2. A filter's largest gain bounds the result from above.
+
+        Raises
+        ------
+        InputError
+            Another shape, or not finite.
         """
-        power = np.abs(gain).astype(np.float64) ** 2
+        ny, nx = self.padded_shape
+        if np.shape(gain) != (ny, nx // 2 + 1) or np.asarray(gain).dtype.kind not in "fciu":
+            raise InputError(f"the filter is {np.shape(gain)}: {(ny, nx // 2 + 1)} numbers were wanted")
+        modulus = np.abs(gain).astype(np.float64)
+        largest = float(modulus.max())
+        if not math.isfinite(largest):
+            raise InputError("the filter holds NaN or infinity: only finite gains can be applied")
+        power = (modulus / (largest or 1.0)) ** 2  # no square overflows
         if self._half_rows:
-            nx = self.padded_shape[1]
             counted = np.where((np.arange(nx // 2 + 1) % nx == 0) | (2 * np.arange(nx // 2 + 1) == nx), 1, 2)
             lines = power @ counted / nx
         else:
             lines = power.mean(axis=0)
         lines[1:] /= 4
-        return math.sqrt(float(lines.max()))
+        return largest * math.sqrt(float(lines.max()))
 
     # ---- frames -------------------------------------------------------------------------------------------
 
@@ -761,6 +773,5 @@ def require_finite_image(image: NDArray[Any]) -> None:
 
 
 def _checked_slot(slot: int) -> int:
-    if slot != int(slot) or slot < 0:
-        raise InputError(f"slot is {slot}: a whole number from 0 on was wanted")
+    require_whole(0, slot=slot)
     return int(slot)
