@@ -186,7 +186,8 @@ class Psf:
         Parameters
         ----------
         turns : (samples, samples) real
-            Phase over the stop in turns, as `pupil_phase.PupilPhase` or `panel_turns` gives it.
+            Phase over the stop in turns, as `pupil_phase.PupilPhase` or `panel_turns` gives it. It must be
+            finite: it lies on the device and is not checked.
         alpha_rad, psi_rad
             The strength it stands for, so that a stop too coarse for it is refused.
 

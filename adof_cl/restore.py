@@ -30,6 +30,8 @@ from adof_cl.program import Argument, Launch, Program, vector_bytes
 FAMILIES = ("lanes", "groups")
 GAIN_LIMIT = 1e15
 """Largest gain of a filter: what no 16-bit frame of 16384 x 16384 can carry beyond float32."""
+FRAME_LIMIT = 1e15
+"""Largest level of a frame of reals for an image of integers: its sum, times `GAIN_LIMIT`, fits float32."""
 
 _HALF_LARGEST = 65504.0
 
@@ -456,7 +458,7 @@ class Restore:
             (ny + nx,) or (k, ny + nx), complex of this plan's precision: h_rows, then h_cols, with real
             Nyquist bins, as `OtfTable.out` holds them; its values are not checked.
         nsr
-            A number, or (ny, nx // 2 + 1) real on the device.
+            A number, or (ny, nx // 2 + 1) real on the device, not checked either.
         entry
             Which row of a (k, n) table to take.
 
@@ -481,6 +483,7 @@ class Restore:
                 f"the table is {table.shape} {table.dtype}, ({ny + nx},) or (k, {ny + nx}) {self._complex} "
                 "was wanted: sample the OTF of rows, then of columns, at the padded size"
             )
+        require_whole(0, entry=entry)
         entries = table.size // (ny + nx)
         if not 0 <= entry < entries:
             raise InputError(f"entry {entry} of the table was asked for: it has {entries}, counted from 0")
@@ -509,7 +512,7 @@ class Restore:
         ----------
         gain
             (ny, nx // 2 + 1) complex, DC at [0, 0]: what `numpy.fft.rfft2` of the padded frame is multiplied
-            by. On the device already, or on the host.
+            by. On the host, or on the device already, where its values are not checked.
 
         Raises
         ------
@@ -587,6 +590,8 @@ class Restore:
         ----------
         frame, out
             (rows, columns) of the plan's `in_dtype` and `out_dtype`; `out` may be `frame` if these agree.
+            A frame of reals must hold finite ones: one NaN or infinity makes every pixel of a real image NaN,
+            and an image of integers black. `restore` checks, this does not: it never waits for the device.
 
         Raises
         ------
@@ -604,6 +609,8 @@ class Restore:
 
     def transform(self, frame: DeviceArray) -> None:
         """Enqueue the first third alone, to `apply` several filters to one frame afterwards.
+
+        What a frame must hold: as for the call.
 
         Raises
         ------
@@ -648,14 +655,34 @@ class Restore:
                 f"the frame is {frame.shape} {frame.dtype}, this plan restores {self.shape} {self.in_dtype}: "
                 "convert it or make a plan for it"
             )
-        if frame.dtype.kind == "f" and not np.isfinite(frame).all():
-            raise InputError("the frame holds NaN or infinity: replace those pixels first")
+        self.require_frame(frame)
         if self._frame is None or self._image is None:
             self._frame = self.device.empty(self.shape, self.in_dtype)
             self._image = self.device.empty(self.shape, self.out_dtype)
         image = self(self._frame.upload(frame), self._image, slot).download()
         require_finite_image(image)
         return image
+
+    def require_frame(self, frame: NDArray[Any]) -> None:
+        """Refuse a frame on the host, of the plan's `in_dtype`, that would spoil its image.
+
+        Raises
+        ------
+        InputError
+            NaN or infinity in it.
+        LimitError
+            Levels beyond `FRAME_LIMIT` where the image is of integers, which could not say it overflowed.
+        """
+        if frame.dtype.kind != "f":
+            return
+        largest = max(float(frame.max()), -float(frame.min()))
+        if not math.isfinite(largest):
+            raise InputError("the frame holds NaN or infinity: replace those pixels first")
+        if self.out_dtype.kind == "u" and largest > FRAME_LIMIT:
+            raise LimitError(
+                f"the frame reaches {largest:g}: an image of {self.out_dtype} wants levels of at most "
+                f"{FRAME_LIMIT:g}, so scale the frame down"
+            )
 
     # ---- inside -------------------------------------------------------------------------------------------
 

@@ -281,12 +281,21 @@ class StageMove:
 
 
 def saturate(velocities: ArrayLike, limits: ArrayLike) -> Array:
-    """Return velocities scaled by one factor so that none exceeds its limit: the direction stays (eq. C5)."""
+    """Return velocities scaled by one factor so that none exceeds its limit: the direction stays (eq. C5).
+
+    Raises
+    ------
+    InputError
+        Another shape, NaN, limits not above 0, or velocities 1e308 times beyond them.
+    """
     wanted = finite_array("velocities", velocities, (None,))
     most = finite_array("limits", limits, (len(wanted),))
     if not np.all(most > 0):
         raise InputError(f"limits are {most.tolist()}: speeds above 0 were wanted")
-    excess = float((np.abs(wanted) / most).max())
+    with np.errstate(over="ignore"):
+        excess = float((np.abs(wanted) / most).max())
+    if not math.isfinite(excess):
+        raise InputError(f"velocities are {wanted.tolist()}, limits {most.tolist()}: too far apart to scale")
     return np.asarray(np.clip(wanted / max(excess, 1.0), -most, most))
 
 

@@ -333,6 +333,8 @@ class SsdSearch:
     def __call__(self, image: DeviceArray) -> None:
         """Enqueue one search of `image` (`image_shape`, `dtype`); fetch the result before the next.
 
+        NaN, infinity and levels beyond 1e16 need no check: a footprint that holds one matches nothing.
+
         Raises
         ------
         InputError

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Generic, Literal, Protocol, TypeVar
 
-import numpy as np
 from numpy.typing import NDArray
 
 from adof_cl.errors import AdofError, InputError, StreamError
@@ -399,10 +398,11 @@ class RestoredFrames:
         ------
         InputError
             Another shape or type, NaN or infinity.
+        LimitError
+            A frame of reals too large for an image of integers.
         """
         self._frames[buffer].require_alike(frame)
-        if frame.dtype.kind == "f" and not np.isfinite(frame).all():
-            raise InputError("the frame holds NaN or infinity: replace those pixels first")
+        self.plan.require_frame(frame)
         self._frames[buffer].stage(frame)
 
     def enqueue(self, buffer: int) -> None:

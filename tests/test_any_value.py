@@ -408,6 +408,12 @@ ON_DEVICE: dict[str, tuple[Call, dict[str, Any]]] = {
     ),
     "Restore.set_filter": (restored_by, {"gain": np.ones((PADDED[0], PADDED[1] // 2 + 1))}),
     "Restore.restore": (restored, {"frame": np.ones(SHAPE, np.float32)}),
+    "Restore.set_filter_table": (
+        lambda d, **k: restore_plan(d).set_filter_table(
+            d.upload(np.ones((2, sum(PADDED)), np.complex64)), **k
+        ),
+        {"nsr": 0.1, "slot": 2, "entry": 1},
+    ),
     "Restore.line_gain": (
         lambda d, gain: restore_plan(d).line_gain(gain),
         {"gain": np.ones((PADDED[0], PADDED[1] // 2 + 1))},
