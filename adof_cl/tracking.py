@@ -385,9 +385,13 @@ class GaussNewton:
             raise InputError(f"patches are {patches.shape}: finite levels of shape {wanted} were wanted")
         if start_yx.shape != (wanted[0], 2) or start_yx.dtype.kind not in "fiu":
             raise InputError(f"start_yx is {start_yx.shape} {start_yx.dtype}: {(wanted[0], 2)} was wanted")
-        if not np.abs(start_yx).max() <= _REACH_PX:
+        if not -_REACH_PX <= start_yx.min() <= start_yx.max() <= _REACH_PX:
             raise InputError(f"start_yx is {start_yx.tolist()}: at most {_REACH_PX} px either way was wanted")
         require_whole(0, iterations=iterations)
+        return self.refined(patches, start_yx, iterations)
+
+    def refined(self, patches: NDArray[Any], start_yx: Array, iterations: int) -> Refinement:
+        """Refine as the call does, unchecked: for patches and starts that are known to fit."""
         coefficients = self._inverses[0] @ patches.astype(np.float64) @ self._inverses[1].T
         shift = start_yx.astype(np.float64)
         image, fit = self._fit(coefficients, shift)
@@ -613,7 +617,7 @@ class TemplateTracker:
         if self.refine != "integer":
             start = quadratic_minimum(found.neighbourhood)
         patches = np.where(np.isfinite(found.patches), found.patches, 0.0)
-        refined = self._refiner(patches, start, 20 if self.refine == "gauss_newton" else 0)
+        refined = self._refiner.refined(patches, start, 20 if self.refine == "gauss_newton" else 0)
         inner = patches[:, _CONTEXT:-_CONTEXT, _CONTEXT:-_CONTEXT]
         ssd = ((inner - self._pixels) ** 2).sum(axis=(1, 2)) / self.full_scale**2
         feature_yx = found.best_yx + self._anchors + refined.shift_yx
