@@ -172,7 +172,15 @@ class Otf1d:
             Whether the pixel's aperture is included.
 
         The Nyquist bin of an even length is real, so that a real image stays real.
+
+        Raises
+        ------
+        InputError
+            No axis, or one of no whole number of samples.
         """
+        require_whole(axes=len(shape))
+        for samples in shape:
+            require_whole(samples=samples)
         gains = []
         for samples in shape:
             gain = np.repeat(

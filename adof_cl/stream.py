@@ -17,6 +17,7 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 from numpy.typing import NDArray
 
 from adof_cl.errors import AdofError, InputError, StreamError
+from adof_cl.optics import require_whole
 from adof_cl.restore import Restore, require_finite_image
 
 Item = TypeVar("Item")
@@ -382,8 +383,7 @@ class RestoredFrames:
     """
 
     def __init__(self, plan: Restore, *, slot: int = 0, buffers: int = 2) -> None:
-        if buffers < 1:
-            raise InputError(f"buffers is {buffers}: at least 1 was wanted")
+        require_whole(buffers=buffers)
         self.plan = plan
         self.slot = slot
         self.buffers = buffers

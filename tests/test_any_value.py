@@ -37,9 +37,14 @@ from adof_cl.errors import AdofError, InputError, LimitError, TrackingError
 from adof_cl.fft_passes import Passes
 from adof_cl.image_prep import ImagePrep, Region
 from adof_cl.optics import Mask, OpticalSystem, PupilGrid, SlmPanel
+from adof_cl.otf_table import OtfTable
+from adof_cl.pipeline import Blur, CameraPipeline
 from adof_cl.pupil_phase import PupilPhase
+from adof_cl.registration import as_seen, register
 from adof_cl.restore import Restore
+from adof_cl.scene import Scene, SceneObject
 from adof_cl.ssd_search import LARGEST_LEVEL, SsdSearch
+from adof_cl.stream import RestoredFrames
 from adof_cl.wiener import WienerFilter
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # NumPy may warn of what is then refused
@@ -461,6 +466,99 @@ ON_DEVICE: dict[str, tuple[Call, dict[str, Any]]] = {
 }
 
 
+def followed(device: Device, alpha: float, psi: float, xy: np.ndarray, frame: np.ndarray) -> object:
+    plan = camera_plan(device)
+    blur = Blur(alpha, psi)
+    (found,) = plan(frame, {"peg": blur}, {"peg": xy})["peg"]
+    return found if not found.lost else (found.feature_xy_px, found.ssd, found.mismatch, found.gain)
+
+
+@cache
+def camera_plan(device: Device) -> CameraPipeline:
+    plan = CameraPipeline(device, OPTICS, GREY.shape, ("peg",), padding=8, search_shape=(30, 30))
+    plan.set_templates("peg", [TEMPLATE])
+    return plan
+
+
+@cache
+def table(device: Device) -> OtfTable:
+    return OtfTable(device, OPTICS, SHAPE, entries=2)
+
+
+def tabled(device: Device, pairs: Any) -> object:
+    table(device).update(pairs)
+    return table(device).axes(1)
+
+
+ON_DEVICE |= {
+    "OtfTable": (
+        lambda d, shape, entries: OtfTable(d, OPTICS, shape, entries=entries).out.shape,
+        {"shape": SHAPE, "entries": 2},
+    ),
+    "OtfTable.update": (tabled, {"pairs": np.array([[1.0, 2.0], [3.0, 4.0]])}),
+    "OtfTable.update_depths": (
+        lambda d, depth: (table(d).update_depths(Mask(1, 1), (0.0, depth)), table(d).axes(1)),
+        {"depth": 100.0},
+    ),
+    "OtfTable.otf": (lambda d, entry: (tabled(d, [(1, 2), (3, 4)]), table(d).otf(entry)), {"entry": 1}),
+    "CameraPipeline": (
+        lambda d, **k: CameraPipeline(d, OPTICS, GREY.shape, ("peg",), **k).shape,
+        {"nsr": 0.01, "padding": 8, "search_shape": (30, 30), "tolerance_rad": 0.01, "buffers": 1},
+    ),
+    "CameraPipeline's call": (
+        followed,
+        {"alpha": 1.0, "psi": 0.5, "xy": np.array([[24.0, 24.0]]), "frame": GREY},
+    ),
+    "RestoredFrames": (
+        lambda d, buffers: RestoredFrames(restore_plan(d), buffers=buffers).buffers,
+        {"buffers": 2},
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """A drawing of its own: random marks."""
+
+    radiance: np.ndarray
+    judged: np.ndarray
+    pitch_um: float = 10.0
+    centre_yx: tuple[float, float] = (60.0, 60.0)
+
+
+MARKS = Picture(
+    np.kron(np.random.default_rng(5).random((30, 30), np.float32), np.ones((4, 4), np.float32)),
+    np.ones((120, 120), np.bool_),
+)
+SCALE = 0.05 * np.eye(2)
+MARKED = np.pad(as_seen(MARKS, SCALE)[0], 12, mode="edge")
+
+HOST |= {
+    "as_seen": (
+        lambda matrix, fraction_px: as_seen(MARKS, matrix, fraction_px),
+        {"matrix": SCALE, "fraction_px": np.array([0.2, 0.3])},
+    ),
+    "register": (
+        lambda image, matrix, expected_px, reach_px: register(
+            image, MARKS, matrix, expected_px=expected_px, reach_px=reach_px
+        ),
+        {"image": MARKED, "matrix": SCALE, "expected_px": np.array([42.0, 42.0]), "reach_px": 6.0},
+    ),
+    "Blur": (
+        lambda depth: Blur.of(Mask(1, 1), OPTICS, depth),
+        {"depth": 100.0},
+    ),
+    "SceneObject": (
+        lambda **k: SceneObject("peg", **k),
+        {"depth_um": 1.0, "depth_sigma_um": 1.0, "extent_px": 90.0, "features": 2, "place_sigma_px": 1.0},
+    ),
+    "Scene": (
+        lambda **k: Scene((SceneObject("peg", 0.0),), **k),
+        {"noise_grey": 1.3, "frame_rate_hz": 60.0, "shape": (400, 512), "tilt_deg": 30.0},
+    ),
+}
+
+
 def wrong(good: Any) -> Iterator[Any]:
     """Yield what may come in place of a good argument."""
     if isinstance(good, float):
@@ -471,6 +569,9 @@ def wrong(good: Any) -> Iterator[Any]:
         numbers = NUMBERS if isinstance(good[0], float) else COUNTS
         yield from ((number, good[1]) for number in numbers)
         yield from ((), good[:1], (*good, good[0]))
+    elif isinstance(good, np.ndarray) and good.dtype == np.uint8:
+        yield from (np.zeros_like(good), np.full_like(good, 255), good[:0], good[:-1], good.ravel())
+        yield from (good.astype(kind) for kind in (np.float32, np.uint16, object, str))
     elif isinstance(good, np.ndarray):
         if good.dtype.kind in "fc":
             for number in NUMBERS:
