@@ -169,8 +169,9 @@ class FollowedStage:
 
     def __init__(self, stage: Stage) -> None:
         self.stage = stage
-        now_s = time.monotonic()
-        self._axes = {name: RecordedAxis(now_s, value) for name, value in stage.position().items()}
+        self._reading = threading.Lock()
+        self._read_s = time.monotonic()
+        self._axes = {name: RecordedAxis(self._read_s, value) for name, value in stage.position().items()}
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._follow, name="positions", daemon=True)
 
@@ -185,19 +186,27 @@ class FollowedStage:
     def _follow(self) -> None:
         pause_s = _FOLLOWED_S
         while not self._closing.wait(pause_s):
-            asked_s = time.monotonic()
             try:
-                position = self.stage.position()
+                # A slow line is left to the commands for most of the time.
+                pause_s = max(_FOLLOWED_S, 3 * self._read())
             except DriverError:
                 return  # it is stopped; whoever asks next is told why
+
+    def _read(self) -> float:
+        """Read every axis and keep it; returns how long that took, s."""
+        with self._reading:
+            asked_s = time.monotonic()
+            position = self.stage.position()
             answered_s = time.monotonic()
             for name, value in position.items():
                 self._axes[name].add((asked_s + answered_s) / 2, value)
-            # A slow line is left to the commands for most of the time.
-            pause_s = max(_FOLLOWED_S, 3 * (answered_s - asked_s))
+            self._read_s = asked_s
+        return answered_s - asked_s
 
     def position_at(self, time_s: float) -> dict[str, float]:
         """Return where every axis was, straight on between two readings."""
+        if self._read_s < time_s:  # the thread was held up
+            self._read()
         return {name: float(axis.at(time_s)) for name, axis in self._axes.items()}
 
     @property
