@@ -358,9 +358,7 @@ class GigeCamera:
         return Frame(
             pixels=self._pixels(taken) if complete else np.zeros(self.shape, self._dtype),
             number=self._numbers.number(taken.block_id, believed=complete),
-            time_s=received_s
-            if device_s is None or not complete
-            else self._exposed_s(device_s, received_s),
+            time_s=received_s if device_s is None or not complete else self._exposed_s(device_s, received_s),
             received_s=received_s,
             device_time_s=device_s,
             complete=complete,
