@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from adof_cl.errors import InputError, TrackingError
-from adof_cl.optics import require_finite, require_positive
+from adof_cl.optics import require_finite, require_positive, require_whole
 
 Array = NDArray[np.float64]
 
@@ -127,8 +127,8 @@ def focus_sweep(
     require_finite(low=low, high=high)
     if low >= high:
         raise InputError(f"the range {low} to {high} is empty: give the smaller end first")
-    if coarse < 5 or rounds < 1:
-        raise InputError(f"coarse is {coarse} and rounds {rounds}: at least 5 and 1 were wanted")
+    require_whole(5, coarse=coarse)
+    require_whole(1, rounds=rounds)
 
     def score(position: float) -> float:
         answer = measure(float(position))

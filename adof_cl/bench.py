@@ -27,7 +27,8 @@ import scipy
 from adof_cl import __version__
 from adof_cl.bench_cases import parse_sizes, select
 from adof_cl.device import Device
-from adof_cl.errors import AdofError, InputError
+from adof_cl.errors import AdofError
+from adof_cl.files import read_versioned
 from adof_cl.peers import THREADS, Peer
 from adof_cl.program import Program
 from adof_cl.turns import (
@@ -163,21 +164,7 @@ class Report:
         InputError
             It cannot be read, or is not one of this version's.
         """
-        try:
-            report = _REPORT.validate_json(path.read_bytes())
-        except OSError as failure:
-            raise InputError(
-                f"{path} cannot be read ({failure.strerror}): give a file of --json"
-            ) from failure
-        except pydantic.ValidationError as failure:
-            raise InputError(
-                f"{path} is not a results file of adof bench: give one that --json wrote"
-            ) from failure
-        if report.schema_version != SCHEMA:
-            raise InputError(
-                f"{path} has schema version {report.schema_version}, {SCHEMA} was wanted: measure it anew"
-            )
-        return report
+        return read_versioned(path, _REPORT, SCHEMA, "a results file", "adof bench --json FILE")
 
 
 _REPORT = pydantic.TypeAdapter(Report)

@@ -368,6 +368,8 @@ class Device:
         None, or a list to which every launch adds its event: set one on a profiling device to time kernels.
     vector_bytes
         What `program.vector_bytes` found, once it was asked.
+    build_options
+        Compiler options of every program made from now on, such as "-cl-denorms-are-zero".
     """
 
     def __init__(
@@ -382,6 +384,7 @@ class Device:
         self.handle = handle
         self.events: list[cl.Event] | None = None
         self.vector_bytes: int | None = None
+        self.build_options: tuple[str, ...] = ()
         self.context = cl.Context([handle])
         self._kept: list[cl.Buffer] = []
         self._shares_memory = facts.kind == "cpu" and not facts.simulated and _shares_memory(handle)

@@ -22,6 +22,7 @@ from adof_cl.errors import AdofError
 from adof_cl.noise import noise_to_signal
 from adof_cl.optics import Mask, OpticalSystem, PupilGrid
 from adof_cl.otf import Otf1d
+from adof_cl.program import Program
 from adof_cl.pupil_phase import PupilPhase
 from adof_cl.restore import Restore
 from adof_cl.servo import require_stable_gain, samples_late, stability_limit_per_s
@@ -285,8 +286,13 @@ def _scene(shape: tuple[int, int], kind: Any) -> Array:
     return (top * np.random.default_rng(2).uniform(0.25, 0.75, shape)).astype(kind)
 
 
-def _restored(plan: Restore, at: float | str, frame: Array, axes: tuple[Array, Array], nsr: float) -> Point:
-    """Restore and compare; the error is the image's rms over the wanted image's or the frame's range."""
+def _restored(
+    plan: Restore, at: float | str, frame: Array, axes: tuple[Array, Array], nsr: float, noisy: bool = False
+) -> Point:
+    """Restore and compare; the error is the image's rms over the wanted image's or the frame's range.
+
+    `noisy`: no two of the frame's pixels are alike, so that roundings are independent.
+    """
     gain = reference.wiener_of_axes(axes[0], axes[1], nsr)
     largest = float(np.abs(gain).max())
     plan.set_filter_axes(axes[0], axes[1], nsr)
@@ -298,13 +304,14 @@ def _restored(plan: Restore, at: float | str, frame: Array, axes: tuple[Array, A
     energy = max(float(np.linalg.norm(whole)), float(np.linalg.norm(frame)))
     if plan.out_dtype.kind == "u":
         top = float(np.iinfo(plan.out_dtype).max)
+        inside = float(((wanted > 0) & (wanted < top)).mean())  # what is clamped shows no error
         wanted = np.clip(wanted, 0, top)
-        step = _HALF_STEP if plan.spectrum_dtype == np.float16 else _eps("float32") * 4
-        flushed = _HALF_LEAST * max(top / 255, 1) * 2 * (1 + largest) if step == _HALF_STEP else 0.0
-        # Half a level from rounding, and a step of each stored number, before the filter and behind it.
-        spread = step * (1 + largest) * energy / math.sqrt(size)
+        if plan.spectrum_dtype == np.float16:
+            spread = _half_spread(plan, whole, gain, noisy) * math.sqrt(inside if noisy else 1)
+        else:
+            spread = 4 * _eps("float32") * (1 + largest) * energy
         error = float(np.linalg.norm(found - wanted)) / math.sqrt(size)
-        return _answer(at, error, 0.5 + spread + flushed)
+        return _answer(at, error / top, (0.5 + spread / math.sqrt(size)) / top)
     limit = 5e-7 if plan.out_dtype == np.float32 else 1e-14
     floor = _FLOAT_LEAST * math.sqrt(size) * plan.padded_shape[0] * plan.padded_shape[1]
     norm = float(np.linalg.norm(wanted))
@@ -312,6 +319,29 @@ def _restored(plan: Restore, at: float | str, frame: Array, axes: tuple[Array, A
     error = float(np.linalg.norm(found - wanted))
     scale = max(norm, allowed, 1e-300)
     return _answer(at, error / scale, allowed / scale)
+
+
+def _half_spread(plan: Restore, whole: Array, gain: Array, noisy: bool) -> float:
+    """Return the norm of the error that keeping a spectrum in halves leaves in the image.
+
+    Each number is stored twice, before the filter and after it, and errs by at most 2^-11 of itself, or by
+    2^-14 where a device flushes; an rms of 2^-11/root 3 where roundings are independent. The first error goes
+    through the filter: independent ones by its rms along their line, others by at most its largest.
+    """
+    ny, nx = plan.padded_shape
+    modulus = np.abs(gain)
+    mirrored = np.roll(modulus[::-1, 1 : nx - nx // 2], 1, axis=0)[:, ::-1]
+    power = np.concatenate([modulus, mirrored], axis=1) ** 2
+    outer = 0 if plan.family == "lanes" else 1
+    lines = (np.abs(np.fft.fft(whole, axis=outer)) ** 2).sum(axis=1 - outer) / whole.shape[outer]
+    through = power.mean(axis=1 - outer) if noisy else power.max(axis=1 - outer)
+    after = float((power * np.abs(np.fft.fft2(whole)) ** 2).sum()) / (ny * nx)
+    before = float(lines @ through)
+    relative = math.sqrt((before + after) / 3) if noisy else math.sqrt(before) + math.sqrt(after)
+    # Numbers are stored as 256ths of the frame's range; float32 adds four eps on the way.
+    level = max(float(np.iinfo(plan.in_dtype).max) / 255, 1)
+    absolute = _HALF_LEAST * level * math.sqrt(ny * nx) * (1 + math.sqrt(float(through.mean())))
+    return (_HALF_STEP + 4 * _eps("float32")) * relative + absolute
 
 
 def _restore_nsr(device: Device, storage: str, full: bool) -> Iterator[Point]:
@@ -326,22 +356,23 @@ def _restore_nsr(device: Device, storage: str, full: bool) -> Iterator[Point]:
         if storage == "half" and gain > plan.half_gain_limit:
             yield _refusal(nsr, plan.set_filter_axes, *axes, nsr)
         else:
-            yield _restored(plan, nsr, frame, axes, nsr)
+            yield _restored(plan, nsr, frame, axes, nsr, noisy=True)
     for nsr in (-1.0, 1e13, math.nan):
         yield _refusal(nsr, plan.set_filter_axes, *axes, nsr)
     # Without noise: a blur that is nowhere 0.
     rows, columns = (1 / (1 + 4 * np.abs(np.fft.fftfreq(n))) for n in plan.padded_shape)
-    yield _restored(plan, 0.0, frame, (rows, columns), 0.0)
+    yield _restored(plan, 0.0, frame, (rows, columns), 0.0, noisy=True)
 
 
 def _restore_size(device: Device, storage: str, full: bool) -> Iterator[Point]:
-    sizes = [(8, 4096), (127, 251)]
+    sizes = [(8, 8), (127, 251), (8, 4096)]
     if full:
-        sizes += [(8, 8), (9, 8), (4093, 8), (509, 1021), (4093, 4093)]
+        sizes += [(9, 8), (4093, 8), (509, 1021), (4093, 4093)]
     for shape in sizes:
         plan = _plan(device, shape, storage)
         axes = _coded_axes(plan.padded_shape, storage)
-        yield _restored(plan, float(math.prod(shape)), _scene(shape, plan.in_dtype), axes, 0.05)
+        scene = _scene(shape, plan.in_dtype)
+        yield _restored(plan, float(math.prod(shape)), scene, axes, 0.05, noisy=True)
     for side in (1, 2, 7, 4097, 8192):
         yield _refusal(float(side * side), _plan, device, (side, side), storage)
 
@@ -376,6 +407,54 @@ def _restore_frames(device: Device, storage: str, full: bool) -> Iterator[Point]
                 if value == float(np.finfo(kind).max):
                     spoilt[:] = value
                 yield _refusal(f"{value:g}", plan.restore, spoilt)
+
+
+_DENORMALS = """\
+__kernel void denormals(__global const float *least, __global const float *below, __global float *made,
+                        __global float *taken, __global half *stored, __global float *loaded)
+{
+    const int i = get_global_id(0);
+    made[i] = 0.5f * least[i];
+    taken[i] = 16777216.0f * below[i];
+    vstore_half(ldexp(least[i], 126 - 15), i, stored);
+    loaded[i] = vload_half(i, stored);
+}
+"""
+
+
+def _denormals(device: Device, storage: str, full: bool) -> Iterator[Point]:
+    """Numbers below the least normal one, as programs are built and with the option that lets them be 0."""
+    shape = (127, 251) if full else (24, 20)
+    share = np.linspace(1, 2, 64, endpoint=False, dtype=np.float32)
+    least = share * np.float32(_FLOAT_LEAST)
+    for option in ((), ("-cl-denorms-are-zero",)):
+        own = Device(device.facts, device.handle)
+        own.build_options = option
+        made, taken, loaded = (own.empty(share.shape, np.float32) for _ in range(3))
+        below, stored = own.upload(least / 2), own.empty(share.shape, np.float16)
+        program = Program(own, "precision.h", generated=("denormals.cl", _DENORMALS))
+        program.launch(
+            "denormals", share.shape, None, own.upload(least), below, made, taken, stored, loaded
+        )()
+        name = option[0] if option else "as built"
+        results = (
+            [("a half", loaded, share * 2.0**-15, _HALF_LEAST)]
+            if storage == "half"
+            else [
+                ("a result", made, share.astype(np.float64) * _FLOAT_LEAST / 2, _FLOAT_LEAST),
+                ("an operand", taken, share * 2.0**-103, 2.0**-102),
+            ]
+        )
+        for what, found, wanted, unit in results:
+            values = found.download().astype(np.float64)
+            kept = "kept" if (values != 0).all() else "0"
+            yield _answer(f"{name}: {what} is {kept}", (values - wanted) / unit, 1.0)
+        plan = _plan(own, shape, storage)
+        axes = _coded_axes(plan.padded_shape, storage)
+        frame = np.zeros(shape, plan.in_dtype)
+        faint = 1 if storage == "half" else _FLOAT_LEAST / 4
+        frame[::2, ::3] = faint
+        yield _restored(plan, f"{name}: a frame of {faint:.2g}", frame, axes, 0.05)
 
 
 def _psf(device: Device, storage: str, full: bool) -> Iterator[Point]:
@@ -419,7 +498,7 @@ def _auto_nsr(device: Device, storage: str, full: bool) -> Iterator[Point]:
     wanted = noise_to_signal(base, otf, shape)
     for unit in (1e-200, 1e-3, 6e4, 1e30, 1e300):
         found = noise_to_signal(base * unit, otf, shape)
-        yield _answer(f"unit {unit:g}", found / wanted - 1, 1e-9)
+        yield _answer(f"unit {unit:g}", found / wanted - 1, 0.0)
     for name, value in (("NaN", math.nan), ("infinity", math.inf)):
         yield _refusal(name, noise_to_signal, base + value, otf, shape)
 
@@ -478,8 +557,90 @@ def _search(device: Device, storage: str, full: bool) -> Iterator[Point]:
         yield _refusal(name, call)
 
 
+@dataclass(frozen=True)
+class Walked:
+    """How far a long walk of tracking has come.
+
+    Attributes
+    ----------
+    frames
+        Measured so far.
+    apart_px
+        Farthest that a place came out from what the same frame gave first: 0 where nothing accumulates.
+    error_sigmas
+        Farthest from the truth, in the standard deviations that each measurement stated for itself.
+    lost
+        Frames without a measurement.
+    unseen
+        How many three frames in a row, of those the walk can take, have not come yet.
+    """
+
+    frames: int
+    apart_px: float
+    error_sigmas: float
+    lost: int
+    unseen: int
+
+
+_SHIFT_PX = 0.8
+# Where image and template agree, a step of Gauss-Newton leaves the square of what it mended times half the
+# ratio of the second slope to the first, 2 pi/6 a pixel in this texture; the last mends less than 1e-4 px.
+_EXACT_PX = 1e-8
+
+
+def walk(
+    device: Device, frames: int, every: int, *, grid: int = 3, refine: str = "gauss_newton"
+) -> Iterator[Walked]:
+    """Follow one feature through a long walk of `frames` frames; yields every `every` of them.
+
+    The frames are a noisy 8-bit texture at grid x grid shifts of 0.8 px; the walk goes from one to itself or
+    a neighbour, by turns, so that every three in a row come equally often. Places are predicted from the two
+    before, as in the loop. What the tracker remembers are those two: once every three in a row have come and
+    each frame always had the same place to the bit, no walk of any length can leave it.
+    """
+    rng = np.random.default_rng(10)
+    n = 48
+    spectrum = np.fft.rfft2(_texture((n, n), 8))
+    fy, fx = np.fft.fftfreq(n)[:, None], np.fft.rfftfreq(n)[None, :]
+    shifts = [(y, x) for y in range(grid) for x in range(grid)]
+    images = []
+    for y, x in shifts:
+        moved = np.fft.irfft2(spectrum * np.exp(-2j * np.pi * _SHIFT_PX * (fy * y + fx * x)), s=(n, n))
+        images.append(np.clip(np.rint(20 + 200 * moved + rng.normal(0, 1, (n, n))), 0, 255).astype(np.uint8))
+    start = np.array([20.0, 22.0])
+    template = Template.cut(images[0], start, (12, 12), noise=1.0)
+    tracker = TemplateTracker(device, (n, n), [template], (24, 24), refine=refine)
+    shown = [device.upload(image) for image in images]
+    near = [
+        [b for b, (y, x) in enumerate(shifts) if max(abs(y - down), abs(x - right)) <= 1]
+        for down, right in shifts
+    ]
+    turns: dict[tuple[int, int], int] = {}
+    unseen = sum(len(around) ** 2 for around in near)
+    first: dict[int, Array] = {}
+    before = at = lost = 0
+    apart = error = 0.0
+    tracker.aim(start[None])
+    for done in range(1, frames + 1):
+        turn = turns.get((before, at), 0)
+        turns[before, at] = turn + 1
+        unseen -= turn < len(near[at])
+        before, at = at, near[at][turn % len(near[at])]
+        (found,) = tracker.track(shown[at])
+        lost += found.lost
+        place = first.setdefault(at, found.feature_xy_px)
+        if place is found.feature_xy_px or place.tobytes() != found.feature_xy_px.tobytes():
+            y, x = shifts[at]
+            truth = start + _SHIFT_PX * np.array([x, y])
+            apart = max(apart, float(np.abs(found.feature_xy_px - place).max()))
+            sigma = np.sqrt(np.diag(found.covariance))
+            error = max(error, float((np.abs(found.feature_xy_px - truth) / sigma).max()))
+        if done % every == 0 or done == frames:
+            yield Walked(done, apart, error, lost, unseen)
+
+
 def _tracking(device: Device, storage: str, full: bool) -> Iterator[Point]:
-    """Two features a pixel apart; then a closed path, whose state must come back to the bit."""
+    """Two features a pixel apart; a closed path, whose state must come back to the bit; then any path."""
     del storage
     n = 96
     image = (255 * _texture((n, n), 8)).astype(np.uint8)
@@ -488,21 +649,27 @@ def _tracking(device: Device, storage: str, full: bool) -> Iterator[Point]:
     tracker = TemplateTracker(device, (n, n), templates, (40, 40))
     frame = device.upload(image)
     found = np.array([m.feature_xy_px for m in tracker.track(frame, truths + 3)])
-    yield _answer("1 px apart", found - truths, 1e-6)
+    yield _answer("1 px apart", found - truths, _EXACT_PX)
 
     steps = np.array([[0, 0], [3, 1], [5, -2], [1, -3], [0, 0], [0, 0]])
     frames = [device.upload(np.roll(image, (dy, dx), (0, 1))) for dx, dy in steps]
     tracker.aim(truths)
-    laps, before = 20 if full else 3, None
-    for _ in range(laps):
-        places = np.array([[m.feature_xy_px for m in tracker.track(frame)] for frame in frames])
-        # What is remembered are two places; the same two at the same frame make every later lap this one.
-        if before is not None:
-            yield _answer("a lap after a lap", places - before, 0.0)
-        before = places
-    assert before is not None
-    apart = before - (truths + steps[:, None, :])
-    yield _answer("after the last lap", apart, 1e-6)
+    # What is remembered are two places; the same two at the same frame make every later lap the one before.
+    laps = np.array(
+        [
+            [[m.feature_xy_px for m in tracker.track(frame)] for frame in frames]
+            for _ in range(20 if full else 3)
+        ]
+    )
+    yield _answer("a lap after a lap", np.diff(laps, axis=0), 0.0)
+    yield _answer("after the last lap", laps[-1] - (truths + steps[:, None, :]), _EXACT_PX)
+
+    for walked in walk(device, 20000, 100, grid=3 if full else 2):
+        if not walked.unseen:
+            break
+    yield _answer("any three frames in a row", walked.apart_px, 0.0)
+    yield _answer("of them unseen or lost", walked.unseen + walked.lost, 0.0)
+    yield _answer("their error, in stated deviations", walked.error_sigmas, 5.0)
 
 
 # ---- stereo and servo -------------------------------------------------------------------------------------
@@ -597,19 +764,27 @@ ROWS: tuple[Row, ...] = (
     Row(
         "restore-nsr", "NSR 0 to 1e6, a transfer function with exact zeros", "image within the bound",
         "NSR below 0, above 1e12, NaN; in halves a gain that a line of stored numbers could not hold",
-        "5e-7 (float32) or 1e-14 of image and of frame times the largest gain; halves: 2^-11 of these and "
-        "half a level", "relative L2; halves: rms levels", "NSR", _restore_nsr, STORAGES,
+        "5e-7 (float32) or 1e-14 of image and of frame times the largest gain; halves: 2^-11/root 3 of each "
+        "number stored, before the filter and behind it, and half a level",
+        "relative L2; halves: rms of range", "NSR", _restore_nsr, STORAGES,
     ),
     Row(
         "restore-size", "8 x 8 to 4093 x 4093, primes, 8 x 4096", "image within the bound",
-        "sides 1, 2, 7, 4097, 8192", "as restore-nsr", "relative L2; halves: rms levels", "pixels",
+        "sides 1, 2, 7, 4097, 8192", "as restore-nsr", "relative L2; halves: rms of range", "pixels",
         _restore_size, STORAGES,
     ),
     Row(
         "restore-frames", "black, saturated, one hot pixel, pedestal 60000 with contrast 3, least numbers",
         "image within the bound", "NaN, infinity, and what overflows on the way",
-        "as restore-nsr; a number below 2^-126 (halves 2^-14) may become 0",
-        "relative L2; integers: rms levels", "frame", _restore_frames, STORAGES,
+        "as restore-nsr; in halves 2^-11 and the largest gain of a line, for a flat frame's roundings agree; "
+        "a number below 2^-126 (halves 2^-14) may become 0",
+        "relative L2; integers: rms of range", "frame", _restore_frames, STORAGES,
+    ),
+    Row(
+        "denormals", "float32 below 2^-126, halves below 2^-14; built as ever and with -cl-denorms-are-zero",
+        "kept or 0, and the image within the bound", "nothing",
+        "a number turned 0 was below the least normal one; images as restore-frames",
+        "least normal numbers; images: as restore-frames", "case", _denormals, ("float32", "half"),
     ),
     Row(
         "psf", "a delta, a full frame, some negative values, any unit", "OTF within the bound",
@@ -618,7 +793,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(
         "auto-nsr", "flat and hot frames; any unit from 1e-200 to 1e300", "above 0, finite, free of the unit",
-        "NaN, infinity", "1e-9: the fit's candidates are a grid, and rounding does not move it",
+        "NaN, infinity", "exact: the answer is one of a grid that the optics alone decide",
         "relative", "frame or unit", _auto_nsr, _HOST,
     ),
     Row(
@@ -628,8 +803,9 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(
         "tracking", "features 1 px apart; laps of a closed path", "no drift: a lap repeats to the bit, so "
-        "any number of laps does", "nothing", "1e-6 px: the step at which Gauss-Newton stops", "px", "case",
-        _tracking, _ONE,
+        "any number of laps does; what comes after any two frames depends on neither", "nothing",
+        "1e-8 px: the square of Gauss-Newton's last step; five standard deviations where there is noise",
+        "px, frames, deviations", "case", _tracking, _ONE,
     ),
     Row(
         "stereo-angle", "5 to 89.9 degrees between the lines of sight", "position within the bound",

@@ -14,6 +14,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from adof_cl.errors import InputError
+
 # What a pass costs for each sample, by radix: with its turns, and as the last pass, which has none.
 #
 # In vectors: nanoseconds measured on one core, the samples in its nearest cache: PoCL with 16 registers,
@@ -66,7 +68,12 @@ def _cheapest(n: int, registers: int) -> tuple[float, tuple[int, ...]]:
                 found = min(found, (turned + cost, (radix, *tail)))
         return found
 
-    return best(n) if n > 1 else (0.0, ())
+    if n == 1:
+        return 0.0, ()
+    found = best(n) if isinstance(n, (int, np.integer)) and n > 1 else (math.inf, ())
+    if math.isinf(found[0]):
+        raise InputError(f"{n} samples came: a whole number without factors but 2, 3, 5 and 7 was wanted")
+    return found
 
 
 @dataclass(frozen=True)

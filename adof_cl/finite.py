@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,20 @@ def finite_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> 
         raise InputError(f"{name} holds {bad} numbers that are NaN or infinite: leave those out")
     checked.flags.writeable = False
     return checked
+
+
+def checked_shape(name: str, shape: Sequence[int], least: int = 1) -> tuple[int, int]:
+    """Return (rows, columns) as whole numbers, or refuse them by name.
+
+    Raises
+    ------
+    InputError
+        Not two whole numbers of at least `least`.
+    """
+    sides = tuple(shape)
+    if len(sides) != 2 or not all(isinstance(n, (int, np.integer)) and n >= least for n in sides):
+        raise InputError(f"{name} is {sides}: (rows, columns), whole numbers of {least} or more, was wanted")
+    return int(sides[0]), int(sides[1])
 
 
 def require_transfer(name: str, values: NDArray[Any]) -> None:

@@ -10,7 +10,10 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError
+from adof_cl.finite import checked_shape
 from adof_cl.program import Program
+
+_LARGEST_LEVEL = 1e16
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,8 @@ class Region:
 
     @classmethod
     def middle(cls, frame_shape: tuple[int, int], shape: tuple[int, int]) -> Region:
-        """Return the region of `shape` in the middle of a frame."""
+        """Return the region of `shape` in the middle of a frame; both are (rows, columns)."""
+        frame_shape, shape = checked_shape("frame_shape", frame_shape), checked_shape("shape", shape)
         return cls((frame_shape[0] - shape[0]) // 2, (frame_shape[1] - shape[1]) // 2, *shape)
 
     @property
@@ -73,17 +77,14 @@ class ImagePrep:
         dark: ArrayLike = 0.0,
         gain: ArrayLike = 1.0,
     ) -> None:
-        if len(frame_shape) != 2 or min(frame_shape) < 1:
-            raise InputError(
-                f"frame_shape is {tuple(frame_shape)}: (rows, columns), each at least 1, was wanted"
-            )
         self.device = device
-        self.frame_shape = frame_shape
+        self.frame_shape = frame_shape = checked_shape("frame_shape", frame_shape)
         self.region = region or Region(0, 0, *frame_shape)
         self.in_dtype = np.dtype(in_dtype)
         self.out_dtype = np.dtype(out_dtype)
         r = self.region
-        fits = min(r.top, r.left) >= 0 and min(r.shape) >= 1
+        whole = all(isinstance(n, (int, np.integer)) for n in (r.top, r.left, *r.shape))
+        fits = whole and min(r.top, r.left) >= 0 and min(r.shape) >= 1
         if not fits or r.top + r.rows > frame_shape[0] or r.left + r.columns > frame_shape[1]:
             raise InputError(f"{r} does not lie inside a frame of {tuple(frame_shape)}: choose one that does")
         if self.in_dtype not in (np.uint8, np.uint16):
@@ -92,6 +93,12 @@ class ImagePrep:
             raise InputError(f"out_dtype is {self.out_dtype}: choose float32 or uint8")
 
         maps = [self._map("dark", dark), self._map("gain", gain)]
+        brightest = (65535 + float(np.abs(maps[0]).max())) * float(np.abs(maps[1]).max())
+        if not brightest <= _LARGEST_LEVEL:
+            raise InputError(
+                f"dark and gain make levels of up to {brightest:g}: at most {_LARGEST_LEVEL:g} was wanted, "
+                "which a search's sums can hold"
+            )
         per_pixel = any(m.size > 1 for m in maps)
         if per_pixel:
             maps = [np.ascontiguousarray(np.broadcast_to(m, r.shape)) for m in maps]

@@ -27,7 +27,7 @@ from adof_cl.errors import AdofError, InputError, TrackingError
 from adof_cl.mask import ModelCalibration, PaperCalibration, choose_mask
 from adof_cl.optics import Mask, OpticalSystem, SlmPanel
 from adof_cl.pipeline import Blur, CameraPipeline, WindowedPipeline
-from adof_cl.record import Iteration, Position, RunRecord
+from adof_cl.record import Iteration, Latency, Position, RunRecord
 from adof_cl.registration import Drawing, register
 from adof_cl.replan import Budget, Replanner
 from adof_cl.scene import Scene
@@ -68,7 +68,7 @@ class Camera(Protocol):
 class Modulator(Protocol):
     """A sink for panel codes."""
 
-    def show(self, codes: Pixels) -> None: ...  # noqa: D102
+    def show(self, codes: Pixels) -> object: ...  # noqa: D102
 
 
 class Stage(Protocol):
@@ -79,6 +79,7 @@ class Stage(Protocol):
     @property
     def speed_limits(self) -> Mapping[str, float]: ...  # noqa: D102
     def position(self) -> Mapping[str, float]: ...  # noqa: D102
+    def position_at(self, time_s: float) -> Mapping[str, float]: ...  # noqa: D102
     def move_to(self, targets: Mapping[str, float], *, speed: float | None = None) -> None: ...  # noqa: D102
     def stop(self) -> None: ...  # noqa: D102
     def wait_until_still(self) -> None: ...  # noqa: D102
@@ -131,6 +132,8 @@ class Design(Protocol):
     def panel(self) -> SlmPanel: ...  # noqa: D102
     @property
     def settling_s(self) -> float: ...  # noqa: D102
+    @property
+    def exposure_s(self) -> float: ...  # noqa: D102
     @property
     def frame_rate_hz(self) -> float: ...  # noqa: D102
     @property
@@ -396,7 +399,6 @@ class Assembly:
         self._last_move_um = np.zeros(3)
         self._features: dict[str, tuple[int, int]] = {}
         self._last_frame_s: dict[int, float] = {}
-        self._last_z: tuple[float, float] | None = None
         self._depth_offset_um, self._frames_fused = 0.0, 0
 
     # ---- the whole run ------------------------------------------------------------------------------------
@@ -431,8 +433,10 @@ class Assembly:
             self.record.end_state = f"failed: {type(failure).__name__}"
             raise
         finally:
-            self.rig.coarse.stop()
-            self.rig.fine.stop()
+            try:
+                self.rig.coarse.stop()
+            finally:
+                self.rig.fine.stop()
 
     def prepare(self, known: StereoRig | None = None) -> None:
         """Find, focus, learn and calibrate: everything before the first servo step."""
@@ -546,9 +550,8 @@ class Assembly:
         eye.set_templates(part, templates, TrackingLimits(mismatch=0.7))
         eye.extent_px[part] = extent_px(templates, corners)
 
-    def _turn_templates(self) -> None:
+    def _turn_templates(self, theta: float) -> None:
         """Turn the hole's templates with the hole, as each camera sees a turn."""
-        theta = self.rig.coarse.position()["theta"]
         for eye in self.eyes:
             turned = theta - eye.taught_at_rad
             if abs(turned - eye.turned_rad[HOLE]) < _TURN_RAD:
@@ -644,7 +647,7 @@ class Assembly:
         world = self._hole_world()
         self.world[HOLE] = world
         self.show(self.focused(float(world[2])))
-        self._turn_templates()
+        self._turn_templates(self.rig.coarse.position()["theta"])
         frames = self.look()
         found = []
         for eye, frame in zip(self.eyes, frames, strict=True):
@@ -653,8 +656,8 @@ class Assembly:
             found.append(features)
         return found[0], found[1]
 
-    def _hole_world(self) -> Array:
-        reading = self.rig.coarse.position()
+    def _hole_world(self, reading: Mapping[str, float] | None = None) -> Array:
+        reading = reading or self.rig.coarse.position()
         return np.array([reading["x"], reading["y"], reading["z"]]) + self._world_from_stage
 
     def _learn_rotation(self, start: Mapping[str, float]) -> None:
@@ -751,15 +754,16 @@ class Assembly:
                 left_um = wanted - self._fused_depth_um(sight)
                 error = law.error(sight.hole_px, sight.desired_px, sight.centre_um, left_um)
                 command = law.command(error, quantiser.wake(error))
-                move = quantiser.move(command, now_s - last_s).array
+                # A loop held up takes no longer steps than its law was made for.
+                move = quantiser.move(command, min(now_s - last_s, period_s)).array
             else:
                 command, move = VelocityCommand.zero(), np.zeros(4)
             last_s = now_s
             mask = self._next_mask()
             codes = None if mask == self.eyes[0].mask else self._encoder.codes(mask)
-            compute_ms = 1e3 * (time.perf_counter() - sight.begun)
+            decided = time.perf_counter()
             self._move(move)
-            self._note("coarse", sight, wanted, command.array, compute_ms)
+            self._note("coarse", sight, wanted, command.array, sight.stages(decided, sent=bool(np.any(move))))
             self._change(mask, codes)
             if not sight.usable:
                 continue
@@ -810,7 +814,7 @@ class Assembly:
                 dz = float(np.clip(0.5 * z_left, -step_um, step_um)) if clear else 0.0
             else:
                 move, dz, z_left = np.zeros(2), 0.0, math.inf
-            compute_ms = 1e3 * (time.perf_counter() - sight.begun)
+            decided = time.perf_counter()
             target = {"x": target["x"] + float(move[0]), "y": target["y"] + float(move[1])}
             fine.move_to(target)
             # What the stage was told to mend is mended: the mean starts again from there.
@@ -818,8 +822,9 @@ class Assembly:
                 self.stereo.camera_1.matrix_px_per_um[:, :2], -self._fine_px_per_um @ move
             )
             self._move(np.array([0.0, 0.0, 0.0, dz]))
+            stages = sight.stages(decided, sent=True)
             self._note("fine" if wanted_um == self.options.stand_off_um else "insert", sight, wanted_um,
-                       np.array([move[0], move[1], 0.0, dz]) / dt_s, compute_ms)  # fmt: skip
+                       np.array([move[0], move[1], 0.0, dz]) / dt_s, stages)  # fmt: skip
             self._change(mask, codes)
             calm = sight.usable and count >= 6 and math.hypot(*mean_um) < tolerance_um and abs(z_left) < 0.5
             resting = resting + 1 if calm else 0
@@ -877,7 +882,10 @@ class Assembly:
         assert self.stereo is not None
         frames = self.look()
         begun = time.perf_counter()
-        self._turn_templates()
+        # Where the stage stood in the picture: by now it may be farther on.
+        reading = self.rig.coarse.position_at(frames[0].time_s)
+        age_s = self.rig.clock.now_s - (frames[0].time_s + self.design.exposure_s / 2)
+        self._turn_templates(reading["theta"])
         for eye, frame in zip(self.eyes, frames, strict=True):
             expected = {part: eye.seen[part].xy_px for part in (PEG, HOLE)}
             expected[HOLE] = expected[HOLE] + eye.matrix @ self._last_move_um
@@ -906,17 +914,20 @@ class Assembly:
             )
         if not blind:
             self.world[HOLE] = self.world[PEG] + fix.xyz_um
-            self._require_agreement()
+            self._require_agreement(reading)
         block = self.stereo.camera_1.matrix_px_per_um[:, :2]
         peg, hole = seen[0][PEG], seen[0][HOLE]
         desired = self._desired(block, peg)
         middle_z = float(self.world[HOLE][2] - self._world_from_stage[2])
-        turned = self.rig.coarse.position()["theta"] - self._arm_at_rad
+        turned = reading["theta"] - self._arm_at_rad
         c, s = math.cos(turned), math.sin(turned)
         arm = np.array([[c, -s], [s, c]]) @ self._rotation_arm_um
         at = np.linalg.solve(block, hole.middle - self.stereo.camera_1.project([0.0, 0.0, middle_z]))
         return _Sight(
             begun=begun,
+            seen=time.perf_counter(),
+            age_s=age_s,
+            stage_z_um=float(reading["z"]),
             frame=frames[0],
             hole_px=hole.xy_px,
             desired_px=desired,
@@ -957,16 +968,12 @@ class Assembly:
         The stage's steps are a thirtieth of one frame's depth noise: a running mean of what vision says of
         the stage's zero is better than the last frame.
         """
-        now_s, z_um = self.rig.clock.now_s, float(self.rig.coarse.position()["z"])
-        last_s, last_um = self._last_z or (now_s, z_um)
-        speed = (z_um - last_um) / (now_s - last_s) if now_s > last_s else 0.0
-        self._last_z = now_s, z_um
         self._frames_fused = min(self._frames_fused + 1, _FUSED_FRAMES)
-        offset = sight.depth_um - (z_um - speed * (now_s - sight.frame.time_s))
+        offset = sight.depth_um - sight.stage_z_um
         self._depth_offset_um += (offset - self._depth_offset_um) / self._frames_fused
-        return self._depth_offset_um + z_um
+        return self._depth_offset_um + float(self.rig.coarse.position()["z"])
 
-    def _require_agreement(self) -> None:
+    def _require_agreement(self, reading: Mapping[str, float]) -> None:
         """Refuse to go on when vision and stage tell different stories of where the hole is.
 
         Raises
@@ -975,7 +982,7 @@ class Assembly:
             They differ by more than calibration, rotation about a centre off the hole and motion during an
             exposure can explain.
         """
-        apart = float(np.linalg.norm(self.world[HOLE] - self._hole_world()))
+        apart = float(np.linalg.norm(self.world[HOLE] - self._hole_world(reading)))
         if apart > _DISAGREEMENT_UM:
             raise TrackingError(
                 f"the hole is seen {apart:.0f} um from where its stage says it is, at most "
@@ -990,7 +997,7 @@ class Assembly:
         corners = self.design.hole.corners_um[list(self._features[HOLE])] @ np.array([[c, s], [-s, c]])
         return np.asarray(peg.middle + corners @ block.T)
 
-    def _note(self, stage: str, sight: _Sight, wanted_um: float, velocity: Array, compute_ms: float) -> None:
+    def _note(self, stage: str, sight: _Sight, wanted_um: float, velocity: Array, latency: Latency) -> None:
         """Add one iteration to the record, and a named position where the hole passes it."""
         mask = self.eyes[0].mask
         number = len(self.record.iterations)
@@ -1017,7 +1024,8 @@ class Assembly:
             ssd_peg=sight.ssd_peg,
             epipolar_residual_px=sight.residual_px,
             lost_features=sight.lost,
-            compute_ms=compute_ms,
+            compute_ms=latency.features_ms + latency.law_ms,
+            latency=latency,
             hole_xy_px=tuple(sight.hole_px.mean(axis=0).tolist()),
         )
         iteration = self._observe(iteration, sight.frame.time_s)
@@ -1063,6 +1071,9 @@ class _Sight:
     """What one pair of frames says."""
 
     begun: float
+    seen: float
+    age_s: float
+    stage_z_um: float
     frame: Frame
     hole_px: Array
     desired_px: Array
@@ -1076,6 +1087,15 @@ class _Sight:
     usable: bool
     ssd_hole: float
     ssd_peg: float
+
+    def stages(self, decided: float, *, sent: bool) -> Latency:
+        """Return how long each stage took up to now; without a command there is no last one."""
+        return Latency(
+            frame_ms=1e3 * self.age_s,
+            features_ms=1e3 * (self.seen - self.begun),
+            law_ms=1e3 * (decided - self.seen),
+            command_ms=1e3 * (time.perf_counter() - decided) if sent else math.nan,
+        )
 
 
 def still_picture(pictures: Sequence[Pixels]) -> tuple[Pixels, Array]:

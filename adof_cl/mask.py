@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.special import wofz
 
 from adof_cl.errors import InputError, LimitError
-from adof_cl.optics import Mask, OpticalSystem, require_finite, require_positive
+from adof_cl.optics import Mask, OpticalSystem, require_finite, require_positive, require_whole
+from adof_cl.phase_terms import require_envelope
 
 PAPER_POINTS: tuple[tuple[str, float, float], ...] = (
     ("A", 4000.0, 53.5),
@@ -46,6 +47,9 @@ class Calibration(Protocol):
 
     def depth_um(self, alpha_rad: float) -> float:
         """Return the depth range that a mask covers; never falling with strength."""
+
+
+_LEAST = 1e-6  # of a pattern's frequency in the cut-off, and of its contrast
 
 
 @dataclass(frozen=True)
@@ -139,6 +143,11 @@ class ModelCalibration:
             sensor_share=self.sensor_share,
         )
         u = self._u(self.criterion_lp_per_mm)
+        if min(u, self.threshold) < _LEAST:
+            raise InputError(
+                f"a pattern of {self.criterion_lp_per_mm:g} line pairs per mm at a contrast of "
+                f"{self.threshold:g} came: both at least {_LEAST:g} of their largest were wanted"
+            )
         if u >= 2 or self.contrast(0.0, 0.0) < self.threshold:
             raise InputError(
                 f"a pattern of {self.criterion_lp_per_mm} line pairs per mm does not reach a contrast of "
@@ -160,10 +169,25 @@ class ModelCalibration:
         return 0 <= depth_um <= self.deepest_um
 
     def contrast(self, alpha_rad: float, psi_rad: float, lp_per_mm: float | None = None) -> float:
-        """Return the contrast of a line pattern (the criterion's if none is named) through mask and pixel."""
+        """Return the contrast of a line pattern (the criterion's if none is named) through mask and pixel.
+
+        Raises
+        ------
+        InputError
+            Not finite, or a negative number of line pairs.
+        LimitError
+            A phase beyond the measured range.
+        """
         nu = self.criterion_lp_per_mm if lp_per_mm is None else lp_per_mm
-        values = _modulus(self._u(nu), np.array([alpha_rad]), np.array([psi_rad]))
-        return float(values[0]) * self._pixel(nu)
+        if not (math.isfinite(nu) and nu >= 0):
+            raise InputError(f"lp_per_mm is {nu}: a finite number of 0 or more was wanted")
+        require_envelope(alpha_rad, psi_rad)
+        u = self._u(nu)
+        if u == 0:
+            return 1.0
+        # alpha < 0 is the conjugate of alpha > 0 at -psi, and neither sign changes the modulus.
+        values = _modulus(min(u, 2.0), np.array([abs(alpha_rad)]), np.array([abs(psi_rad)]))
+        return float(values[0]) * self._pixel(nu) * (u < 2)
 
     def alpha_rad(self, depth_um: float) -> float:
         """Return the weakest mask that covers `depth_um`, clamped to what any mask covers.
@@ -327,14 +351,24 @@ def filter_quality(
     nsr
         Noise-to-signal power of the filter, above 0.
     samples
-        Frequencies along each axis.
+        Frequencies along each axis, 1 to 4096.
+
+    Raises
+    ------
+    InputError
+        Not finite, an nsr not above 0, or another number of samples.
+    LimitError
+        A phase beyond the measured range.
 
     Source
     ------
     docs/maths.md, eqs. W12 and W13.
     """
-    require_finite(alpha_rad=alpha_rad, psi_rad=psi_rad)
+    require_envelope(alpha_rad, psi_rad)
     require_positive(nsr=nsr)
+    require_whole(samples=samples)
+    if samples > 4096:
+        raise InputError(f"samples is {samples}: at most 4096 was wanted")
     # alpha < 0 is the conjugate of alpha > 0 at -psi, and neither sign changes the modulus.
     nu = (np.arange(samples) + 0.5) / (2 * samples)  # cycles a pixel, to the sensor's limit
     u = 2 * nu / optics.object_pitch_um * optics.wavelength_um * optics.f_number

@@ -9,7 +9,7 @@ import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
 from adof_cl.errors import InputError
-from adof_cl.finite import finite_array
+from adof_cl.finite import checked_shape, finite_array, require_transfer
 from adof_cl.padding import padded_frame
 
 NSR_LIMIT = 1e12
@@ -72,18 +72,19 @@ def noise_to_signal(
     Raises
     ------
     InputError
-        NaN or infinity in the frame, or an OTF of another size.
+        NaN or infinity in the frame, or an OTF of another size, not finite, or above `TRANSFER_LIMIT`.
 
     Source
     ------
     docs/maths.md, eqs. W7 and W8.
     """
-    ny, nx = padded
+    ny, nx = checked_shape("padded", padded)
     if otf.shape != (ny, nx // 2 + 1):
         raise InputError(f"otf is {otf.shape}, {(ny, nx // 2 + 1)} was wanted: form it for the padded frame")
-    image = np.asarray(frame, dtype=np.float64)
-    if not np.isfinite(image).all():
-        raise InputError("the frame holds NaN or infinity: replace those pixels first")
+    if otf.dtype.kind not in "fciu" or not np.isfinite(otf).all():
+        raise InputError("otf holds NaN, infinity or no numbers: a finite transfer function was wanted")
+    require_transfer("otf", otf)
+    image = finite_array("the frame", frame, (None, None))
     # The result has no unit; without this the power of a frame in a large one would overflow.
     image = image / max(float(np.abs(image).max()), 1e-300)
     spectrum = scipy.fft.rfft2(padded_frame(image - image.mean(), padded, taper=taper))

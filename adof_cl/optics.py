@@ -28,6 +28,16 @@ def require_positive(**values: float) -> None:
             raise InputError(f"{name} is {value}: a finite number above 0 was wanted")
 
 
+def require_whole(least: int = 1, **values: float) -> None:
+    """Refuse anything but a whole number of at least `least`, naming the argument."""
+    for name, value in values.items():
+        if not isinstance(value, (int, np.integer)) or value < least:
+            raise InputError(f"{name} is {value}: a whole number of {least} or more was wanted")
+
+
+_SMALLEST, _LARGEST = 1e-9, 1e12  # of an instrument's numbers: no formula of them over- or underflows
+
+
 @dataclass(frozen=True)
 class OpticalSystem:
     """One camera's optics: a square stop, and distances to the principal planes.
@@ -63,6 +73,9 @@ class OpticalSystem:
             magnification=self.magnification,
             pixel_pitch_um=self.pixel_pitch_um,
         )
+        for name, value in vars(self).items():
+            if not _SMALLEST <= value <= _LARGEST:
+                raise InputError(f"{name} is {value:g}: {_SMALLEST:g} to {_LARGEST:g} was wanted")
 
     @property
     def object_distance_um(self) -> float:
@@ -109,38 +122,71 @@ class OpticalSystem:
         return s * distance / (1 - s)
 
     def normalised_frequency(self, cycles_per_um: float) -> float:
-        """Return u = 2 nu lambda N for a frequency measured at the object; the cut-off is u = 2."""
+        """Return u = 2 nu lambda N for a frequency measured at the object; the cut-off is u = 2.
+
+        Raises
+        ------
+        InputError
+            Not finite.
+        """
+        require_finite(cycles_per_um=cycles_per_um)
         return 2 * cycles_per_um * self.wavelength_um * self.f_number
 
     def frequency_axis(self, samples: int) -> NDArray[np.float64]:
         """Return u at each bin of a discrete Fourier transform over `samples` camera pixels, DC first.
 
         The Nyquist bin of an even length comes out negative, as `numpy.fft.fftfreq` has it.
+
+        Raises
+        ------
+        InputError
+            Not a whole number of 1 or more.
         """
-        if samples < 1:
-            raise InputError(f"samples is {samples}: at least 1 was wanted")
+        require_whole(samples=samples)
         cycles_per_um = np.fft.fftfreq(samples, self.object_pitch_um)
         return np.asarray(2 * cycles_per_um * self.wavelength_um * self.f_number, dtype=np.float64)
 
     def pixel_otf_axis(self, samples: int) -> NDArray[np.float64]:
         """Return the transfer of a full-fill square pixel, sinc(nu p), at each bin of `frequency_axis`."""
+        require_whole(samples=samples)
         return np.sinc(np.fft.fftfreq(samples))
 
     def shift_px(self, alpha_rad: float, psi_rad: float) -> float:
         """Return how far a defocused, cubic-coded object is displaced, in pixels, along x and along y.
 
         psi^2 lambda N / (3 pi alpha p): docs/maths.md, eq. O7; valid while |psi| < 3 |alpha|.
+
+        Raises
+        ------
+        InputError
+            Not finite, or an alpha of 0 or next to it, without which nothing is displaced.
         """
+        require_finite(alpha_rad=alpha_rad, psi_rad=psi_rad)
         if alpha_rad == 0:
             raise InputError("alpha_rad is 0: without a cubic mask defocus does not shift the image")
         blur_px_per_rad = self.wavelength_um * self.f_number / (math.pi * self.object_pitch_um)
-        return blur_px_per_rad * psi_rad**2 / (3 * alpha_rad)
+        shift = blur_px_per_rad * psi_rad * (psi_rad / (3 * alpha_rad))
+        if not math.isfinite(shift):
+            raise InputError(
+                f"alpha_rad is {alpha_rad:g} and psi_rad {psi_rad:g}: a mask that displaces by a finite "
+                "number of pixels was wanted"
+            )
+        return shift
 
     def support_px(self, alpha_rad: float, psi_rad: float) -> float:
-        """Return the geometric width of the point-spread function along one axis, in pixels (eq. O8)."""
+        """Return the geometric width of the point-spread function along one axis, in pixels (eq. O8).
+
+        Raises
+        ------
+        InputError
+            Not finite.
+        """
+        require_finite(alpha_rad=alpha_rad, psi_rad=psi_rad)
         blur_px_per_rad = self.wavelength_um * self.f_number / (math.pi * self.object_pitch_um)
         a, p = 3 * abs(alpha_rad), abs(psi_rad)
-        return blur_px_per_rad * ((a + p) ** 2 / a if p < a else 4 * p)
+        width = blur_px_per_rad * ((a + p) * ((a + p) / a) if p < a else 4 * p)
+        require_finite(support_px=width)
+        return width
 
 
 @dataclass(frozen=True)
@@ -150,7 +196,8 @@ class PupilGrid:
     samples: int
 
     def __post_init__(self) -> None:
-        if not 2 <= self.samples <= 65536:
+        require_whole(2, samples=self.samples)
+        if self.samples > 65536:
             raise InputError(f"samples is {self.samples}: 2 to 65536 pupil samples were wanted")
 
     @property
@@ -162,6 +209,7 @@ class PupilGrid:
     @staticmethod
     def nyquist_samples(alpha_rad: float, psi_rad: float) -> float:
         """Return how many samples the steepest phase needs: (2/pi)(3 |alpha| + 2 |psi|)."""
+        require_finite(alpha_rad=alpha_rad, psi_rad=psi_rad)
         return 2 / math.pi * (3 * abs(alpha_rad) + 2 * abs(psi_rad))
 
 
@@ -195,11 +243,10 @@ class SlmPanel:
     source: str = ""
 
     def __post_init__(self) -> None:
-        if self.rows < 1 or self.columns < 1:
-            raise InputError(
-                f"panel {self.name} has {self.rows} x {self.columns} pixels: at least 1 x 1 was wanted"
-            )
+        require_whole(rows=self.rows, columns=self.columns)
         require_positive(pitch_um=self.pitch_um, frame_rate_hz=self.frame_rate_hz)
+        if self.pitch_um < _SMALLEST:
+            raise InputError(f"pitch_um is {self.pitch_um:g}: {_SMALLEST:g} or more was wanted")
         if not 0 < self.fill_factor <= 1:
             raise InputError(f"fill_factor is {self.fill_factor}: above 0 and at most 1 was wanted")
         if not 0 < self.stroke_rad <= 2 * math.pi:
@@ -207,6 +254,7 @@ class SlmPanel:
 
     def stop_px(self, aperture_um: float) -> float:
         """Return how many panel pixels the stop is wide."""
+        require_positive(aperture_um=aperture_um)
         return aperture_um / self.pitch_um
 
     def with_stroke(self, stroke_rad: float) -> SlmPanel:

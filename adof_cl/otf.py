@@ -13,7 +13,8 @@ from scipy.interpolate import CubicSpline
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError, LimitError
-from adof_cl.optics import OpticalSystem, PupilGrid, require_finite
+from adof_cl.finite import require_transfer
+from adof_cl.optics import OpticalSystem, PupilGrid, require_whole
 from adof_cl.phase_terms import ALPHA_LIMIT_RAD, PSI_LIMIT_RAD, require_envelope, wrapped_turns
 from adof_cl.program import Launch, Program, vector_bytes
 
@@ -79,8 +80,7 @@ class Otf1d:
         self.u = np.array(u, dtype=np.float64)
         if self.u.ndim != 1 or not self.u.size:
             raise InputError(f"u has shape {self.u.shape}: a list of at least one frequency was wanted")
-        if pairs < 1:
-            raise InputError(f"pairs is {pairs}: at least 1 was wanted")
+        require_whole(pairs=pairs)
         n = self.u.size
         factors = np.ones((n, 2)) if gain is None else np.asarray(gain, dtype=np.float64)
         if factors.shape == (n,):
@@ -89,6 +89,7 @@ class Otf1d:
             raise InputError(f"gain has shape {factors.shape}: ({n}, 2) or ({n},) was wanted")
         if not (np.isfinite(self.u).all() and np.isfinite(factors).all()):
             raise InputError("u or gain holds NaN or infinity: finite numbers were wanted")
+        require_transfer("gain", factors)
         self.family = family or ("lanes" if device.facts.kind == "cpu" else "groups")
         if self.family not in FAMILIES:
             raise InputError(f"family is '{family}': choose 'lanes' or 'groups'")
@@ -171,7 +172,15 @@ class Otf1d:
             Whether the pixel's aperture is included.
 
         The Nyquist bin of an even length is real, so that a real image stays real.
+
+        Raises
+        ------
+        InputError
+            No axis, or one of no whole number of samples.
         """
+        require_whole(axes=len(shape))
+        for samples in shape:
+            require_whole(samples=samples)
         gains = []
         for samples in shape:
             gain = np.repeat(
@@ -313,12 +322,15 @@ def _halves(
     return coarse, values - coarse
 
 
+_WEAKEST_RAD = 1e-9
+
+
 def stationary_phase_otf(
     u: NDArray[np.float64], alpha_rad: float, psi_rad: float = 0.0, *, as_printed: bool = False
 ) -> NDArray[np.complex128]:
     """Return the paper's approximation, to reproduce and to compare: never for a filter.
 
-    Off by 10 to 200 % of |H| where the paper uses it; above 1 near u = 0, where 1 itself is returned.
+    Off by 10 to 200 % of |H| where the paper uses it; above 1 near u = 0, below |u| = 1e-9 1 itself.
 
     Parameters
     ----------
@@ -331,16 +343,24 @@ def stationary_phase_otf(
     Raises
     ------
     InputError
-        Not finite, or alpha = 0, where there is no stationary point.
+        Not finite, or alpha below 1e-9, where there is no stationary point.
+    LimitError
+        Beyond the measured range.
 
     Source
     ------
     The paper's Eq. 2; docs/maths.md, eq. O6.
     """
-    require_finite(alpha_rad=alpha_rad, psi_rad=psi_rad)
-    if alpha_rad == 0:
-        raise InputError("alpha_rad is 0: the approximation wants a cubic mask, use the exact form")
+    require_envelope(alpha_rad, psi_rad)
+    if abs(alpha_rad) < _WEAKEST_RAD:
+        raise InputError(
+            f"alpha_rad is {alpha_rad:g}: the approximation wants a cubic mask of {_WEAKEST_RAD:g} or more, "
+            "use the exact form"
+        )
     at = np.asarray(u, dtype=np.float64)
+    if not np.isfinite(at).all():
+        raise InputError("u holds NaN or infinity: finite frequencies were wanted")
+    at = np.where(np.abs(at) < _WEAKEST_RAD, 0.0, np.clip(at, -3, 3))
     safe = np.where(at == 0, 1.0, at)
     phase = alpha_rad * at**3 / 4
     if not as_printed:
@@ -370,6 +390,7 @@ class SeparableMaskOtf:
     """
 
     def __init__(self, device: Device, samples: int = 4096, *, precision: str = "float32") -> None:
+        require_whole(2, samples=samples)
         if samples & (samples - 1):
             raise InputError(f"samples is {samples}: a power of two was wanted")
         self.x = PupilGrid(samples).x
@@ -437,7 +458,15 @@ class SeparableMaskOtf:
     def evaluate(
         self, profile_rad: NDArray[np.float64], u: NDArray[np.float64] | None = None
     ) -> NDArray[np.complexfloating[Any, Any]]:
-        """Return H on the host, at `self.u` or, through a cubic spline, at any frequencies of either sign."""
+        """Return H on the host, at `self.u` or, through a cubic spline, at any frequencies of either sign.
+
+        Raises
+        ------
+        InputError, LimitError
+            As the call does, or a frequency that is no finite number.
+        """
+        if u is not None and not (np.asarray(u).dtype.kind in "fiu" and np.isfinite(u).all()):
+            raise InputError("u holds NaN, infinity or no numbers: finite frequencies were wanted")
         values: NDArray[np.complexfloating[Any, Any]] = self(profile_rad).download()
         if u is None:
             return values

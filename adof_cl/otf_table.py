@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError
-from adof_cl.optics import Mask, OpticalSystem
+from adof_cl.finite import checked_shape
+from adof_cl.optics import Mask, OpticalSystem, require_whole
 from adof_cl.otf import Otf1d
 
 
@@ -60,7 +61,7 @@ class OtfTable:
         precision: str = "float32",
     ) -> None:
         self.optics = optics
-        self.shape = shape
+        self.shape = checked_shape("shape", shape)
         self.entries = entries
         self._plan = Otf1d.for_frame(device, optics, shape, pixel=pixel, pairs=entries, precision=precision)
         self.out: DeviceArray = self._plan.out
@@ -93,7 +94,8 @@ class OtfTable:
         InputError
             No such entry.
         """
-        if not 0 <= entry < self.entries:
+        require_whole(0, entry=entry)
+        if entry >= self.entries:
             raise InputError(f"entry is {entry}: 0 to {self.entries - 1} was wanted")
         line = self.out.download()[entry]
         return line[: self.shape[0]], line[self.shape[0] :]

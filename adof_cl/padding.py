@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 
 from adof_cl.errors import InputError
 from adof_cl.fft_passes import cost_of
+from adof_cl.finite import checked_shape, finite_array
+from adof_cl.optics import require_whole
 
 SMALLEST_SIDE = 8
 LARGEST_SIDE = 4096
@@ -21,10 +24,16 @@ def good_size(at_least: int) -> int:
 
     That length itself if it is one. Else the next, or one up to a sixteenth longer whose passes cost less:
     512 samples are transformed sooner than 500.
+
+    Raises
+    ------
+    InputError
+        Not a whole number of 1 or more.
     """
+    require_whole(at_least=at_least)
     longest = at_least + at_least // 16
-    found = [n for n in range(max(1, at_least), longest + 1) if _is_product(n)]
-    if found and found[0] == max(1, at_least):
+    found = [n for n in range(at_least, longest + 1) if _is_product(n)]
+    if found and found[0] == at_least:
         return found[0]
     if not found:
         found = [next(n for n in itertools.count(longest) if _is_product(n))]
@@ -40,7 +49,8 @@ def _is_product(n: int) -> bool:
 
 def checked_frame_shape(shape: tuple[int, ...]) -> tuple[int, int]:
     """Refuse anything but two sides of 8 to 4096."""
-    if len(shape) != 2 or not all(SMALLEST_SIDE <= side <= LARGEST_SIDE for side in shape):
+    whole = all(isinstance(side, (int, np.integer)) for side in shape)
+    if len(shape) != 2 or not whole or not all(SMALLEST_SIDE <= side <= LARGEST_SIDE for side in shape):
         raise InputError(
             f"the frame's shape is {tuple(shape)}: (rows, columns) of {SMALLEST_SIDE} to {LARGEST_SIDE} each "
             "were wanted"
@@ -57,8 +67,8 @@ def padded_shape(shape: tuple[int, int], padding: int | tuple[int, int]) -> tupl
         A frame beyond the limits, a negative padding, or one that makes an axis longer than 16384.
     """
     rows, columns = checked_frame_shape(shape)
-    pair = (padding, padding) if isinstance(padding, (int, np.integer)) else tuple(padding)
-    if len(pair) != 2 or any(p != int(p) or p < 0 for p in pair):
+    pair = tuple(padding) if isinstance(padding, Sequence) else (padding, padding)
+    if len(pair) != 2 or not all(isinstance(p, (int, np.integer)) and p >= 0 for p in pair):
         raise InputError(f"padding is {padding}: one whole number or (rows, columns), 0 or more, was wanted")
     ny, nx = good_size(rows + int(pair[0])), good_size(columns + int(pair[1]))
     if max(ny, nx) > LARGEST_PADDED_SIDE:
@@ -75,10 +85,16 @@ def padding_weights(samples: int, taper: bool) -> NDArray[np.float64]:
     The padding lies behind the far edge and, the transform being periodic, before the near one: it starts as
     a copy of the far edge (0) and ends as a copy of the near edge (1), by a raised cosine or by a step.
 
+    Raises
+    ------
+    InputError
+        Not a whole number of 0 or more samples.
+
     Source
     ------
     docs/maths.md, eq. W4.
     """
+    require_whole(0, samples=samples)
     t = np.arange(samples)
     if taper:
         return np.asarray(np.sin(np.pi / 2 * (t + 1) / (samples + 1)) ** 2, dtype=np.float64)
@@ -88,11 +104,19 @@ def padding_weights(samples: int, taper: bool) -> NDArray[np.float64]:
 def padded_frame(frame: NDArray[Any], padded: tuple[int, int], *, taper: bool = True) -> NDArray[np.float64]:
     """Return the frame at [0, 0] of a larger array, continued as `padding_weights` says, on the host.
 
+    Raises
+    ------
+    InputError
+        A frame that is no (rows, columns), holds NaN or infinity, or is larger than `padded`.
+
     Source
     ------
     docs/maths.md, eq. W3.
     """
-    image = np.asarray(frame, dtype=np.float64)
+    image = finite_array("the frame", frame, (None, None))
+    rows, columns = checked_shape("padded", padded)
+    if rows < image.shape[0] or columns < image.shape[1]:
+        raise InputError(f"padded is {(rows, columns)}: at least the frame's {image.shape} was wanted")
     for axis in (0, 1):
         w = padding_weights(padded[axis] - image.shape[axis], taper)
         near, far = np.take(image, [0], axis), np.take(image, [-1], axis)

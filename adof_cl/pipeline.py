@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError, TrackingError
-from adof_cl.optics import Mask, OpticalSystem, require_finite, require_positive
+from adof_cl.noise import checked_nsr
+from adof_cl.optics import Mask, OpticalSystem, require_finite, require_positive, require_whole
 from adof_cl.otf_table import OtfTable
 from adof_cl.phase_terms import require_envelope
 from adof_cl.restore import Restore
@@ -139,9 +140,9 @@ class CameraPipeline:
         tolerance_rad: float = SAME_RAD,
         buffers: int = 1,
     ) -> None:
-        if buffers < 1:
-            raise InputError(f"buffers is {buffers}: at least 1 was wanted")
+        require_whole(buffers=buffers)
         require_positive(tolerance_rad=tolerance_rad)
+        checked_nsr(float(nsr), (1, 1))
         self.device = device
         self.optics = optics
         self.shape = shape

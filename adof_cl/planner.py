@@ -8,7 +8,7 @@ between objects once the mask is chosen, so that every mask's best is found exac
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -20,6 +20,7 @@ from adof_cl.mask import filter_quality
 from adof_cl.optics import Mask, OpticalSystem, require_positive
 from adof_cl.pipeline import SAME_RAD, Window
 from adof_cl.profile import (
+    REFERENCE,
     REFINES,
     RESTORATIONS,
     SEARCHES,
@@ -42,6 +43,7 @@ _LOST_PX = 1e3  # a feature that is not found
 _MOST_FRAMES = 64  # between two looks of camera 2
 _EVERY = (1, 4, 16)  # where it is looking more often that the time is spent on
 _MOST_TOLERANCE_RAD = 1.0
+_OPTICS_ALIKE = 1.25  # blur in pixels within this factor of the profile's
 
 
 @dataclass(frozen=True)
@@ -139,25 +141,26 @@ class _Errors:
         self.flat, self.shares = np.array(flat), np.array(shares)
         self.alphas = np.array(alphas)
         self._log_alphas = np.log(self.alphas)
-        self._noise_grey = profile.noise_grey
+        self.noises = np.array(profile.noises_grey)
         self.restored = [kind for kind in kinds if kind[0] != "none"]
         self.plain = [kind for kind in kinds if kind[0] == "none"]
 
         def table(
             kinds: Sequence[tuple[str, str]], alphas: Sequence[float], shares: Sequence[float]
         ) -> Array:
-            values = np.full((2, len(kinds), len(alphas), len(shares)), _LOST_PX)
+            values = np.full((len(self.noises), len(kinds), len(alphas), len(shares)), _LOST_PX)
             for k, a, s in product(range(len(kinds)), range(len(alphas)), range(len(shares))):
                 entry = rows.get((*kinds[k], alphas[a], shares[s]))
                 if entry is not None:
-                    values[:, k, a, s] = np.minimum([entry.bias_px, entry.noise_px], _LOST_PX)
-            return values
+                    values[:, k, a, s] = np.minimum(entry.errors_px, _LOST_PX)
+            # More noise never helps: where it seemed to, a few frames were lucky.
+            return np.asarray(np.maximum.accumulate(values, axis=0))
 
         self._plain = table(self.plain, [0.0], flat)[:, :, 0]
         self._restored = table(self.restored, alphas, shares)
         # In focus an object was measured beside one that is far out. Where that one's blur lost it, an object
         # that is a little out, beside one no farther, is found: no better than at the next share.
-        lost = (self._restored[:, :, :, 0] >= _LOST_PX).any(axis=(0, 1))
+        lost = (self._restored[0, :, :, 0] >= _LOST_PX).any(axis=0)
         self.focused_alpha_rad = float(self.alphas[~lost].max(initial=0.0))
         self._restored[:, :, lost, 0] = self._restored[:, :, lost, 1]
 
@@ -167,7 +170,7 @@ class _Errors:
             return np.full(len(self.plain), np.inf)
         i, w = _place(self.flat, psi_rad)
         values = (1 - w) * self._plain[:, :, i] + w * self._plain[:, :, i + 1]
-        return self._total(values, noise_grey)
+        return self._at(values, noise_grey)
 
     def with_mask(self, alpha_rad: float, share: float, noise_grey: float) -> Array:
         """Return the errors (px) of `restored` kinds; infinite outside what was measured."""
@@ -178,10 +181,12 @@ class _Errors:
         g = self._restored
         values = (1 - w) * ((1 - v) * g[:, :, i, j] + v * g[:, :, i, j + 1])
         values = values + w * ((1 - v) * g[:, :, i + 1, j] + v * g[:, :, i + 1, j + 1])
-        return self._total(values, noise_grey)
+        return self._at(values, noise_grey)
 
-    def _total(self, values: Array, noise_grey: float) -> Array:
-        total = np.hypot(values[0], values[1] * (noise_grey / self._noise_grey))
+    def _at(self, values: Array, noise_grey: float) -> Array:
+        """Return errors at a noise between those measured: their squares are linear in its square."""
+        i, w = _place(self.noises**2, noise_grey**2)
+        total = np.sqrt((1 - w) * values[i] ** 2 + w * values[i + 1] ** 2)
         return np.where(total > _LOST_PX / 50, np.inf, total)
 
 
@@ -195,13 +200,11 @@ def _place(grid: Array, value: float) -> tuple[int, float]:
 class _Times:
     """Times of chains: a restoration in a window plus a search, each as measured."""
 
-    def __init__(self, profile: DeviceProfile) -> None:
-        self.shared_s = profile.shared_s
-        measured = {(t.chain, t.features): t.time_s.median for t in profile.times}
-        base = Chain("float32", 160, "quadratic", TEMPLATE_PX, SEARCHES[0])
-        if (base, 1) not in measured:
-            raise InputError("the profile holds no times to plan with: measure it anew with adof tradeoff")
-        self._base = measured[base, 1]
+    def __init__(self, profile: DeviceProfile, pace: float) -> None:
+        self.shared_s = pace * profile.shared_s
+        measured = {(t.chain, t.features): pace * t.time_s.median for t in profile.times}
+        base = REFERENCE
+        self._base = pace * profile.reference_s
         self._restore = {
             (c.restoration, c.window_px): seconds
             for (c, features), seconds in measured.items()
@@ -212,20 +215,32 @@ class _Times:
             for (c, features), seconds in measured.items()
             if c.restoration == base.restoration and c.window_px == base.window_px
         }
-        self._known: dict[tuple[Chain, int], float] = {}
-        self._form = {(f.restoration, f.window_px): f.time_s.median for f in profile.forms}
+        self._known: dict[tuple[Chain, int, int], float] = {}
+        self._pixels = profile.shape[0] * profile.shape[1]
+        self._form = {(f.restoration, f.window_px): pace * f.time_s.median for f in profile.forms}
 
     def knows(self, restoration: str) -> bool:
         return (restoration, WINDOWS[0]) in self._restore
 
-    def chain(self, chain: Chain, features: int) -> float:
-        """Return the time of one object's chain while its filter stands."""
-        key = chain, features
+    def chain(self, chain: Chain, features: int, shape: tuple[int, int]) -> float:
+        """Return the time of one object's chain, in frames of a shape, while its filter stands."""
+        key = chain, features, 0 if chain.window_px else shape[0] * shape[1]
         if key not in self._known:
-            self._known[key] = self._sum(chain, features)
+            self._known[key] = self._sum(*key)
         return self._known[key]
 
-    def _sum(self, chain: Chain, features: int) -> float:
+    def _window(
+        self, times: Mapping[tuple[str, int], float], restoration: str, side: int, pixels: int
+    ) -> float:
+        """Return what depends on the window; frames of another size than the profile's by their pixels."""
+        seconds = times.get((restoration, side), 0.0)
+        if side or pixels == self._pixels:
+            return seconds
+        largest = max(side for side in WINDOWS)
+        window = times.get((restoration, largest), 0.0)
+        return max(window + (seconds - window) * (pixels - largest**2) / (self._pixels - largest**2), 0.0)
+
+    def _sum(self, chain: Chain, features: int, pixels: int) -> float:
         ends = (SEARCHES[0], SEARCHES[-1])
         share = (chain.search_px - ends[0]) / (ends[1] - ends[0])
         low, high = (
@@ -234,11 +249,12 @@ class _Times:
             for k in (1, 4)
         )
         search = low + (high - low) * (features - 1) / 3
-        return max(self._restore[chain.restoration, chain.window_px] + search - self._base, 1e-6)
+        restore = self._window(self._restore, chain.restoration, chain.window_px, pixels)
+        return max(restore + search - self._base, 1e-6)
 
-    def form(self, chain: Chain) -> float:
+    def form(self, chain: Chain, shape: tuple[int, int]) -> float:
         """Return the time to form its filter anew."""
-        return self._form.get((chain.restoration, chain.window_px), 0.0)
+        return self._window(self._form, chain.restoration, chain.window_px, shape[0] * shape[1])
 
 
 @dataclass(frozen=True)
@@ -260,16 +276,25 @@ class Planner:
     Built once from the profile; `plan` only computes: about a millisecond for two objects, nothing on the
     device.
 
+    Parameters
+    ----------
+    profile
+        The device's.
+    pace
+        How many times as long everything takes now (`adof_cl.pace.pace`).
+
     Raises
     ------
     InputError
-        The profile lacks what plans are made of.
+        The profile lacks what plans are made of; a pace that is not positive.
     """
 
-    def __init__(self, profile: DeviceProfile) -> None:
+    def __init__(self, profile: DeviceProfile, pace: float = 1.0) -> None:
+        require_positive(pace=pace)
         self.profile = profile
+        self.pace = pace
         self._errors = _Errors(profile)
-        self._times = _Times(profile)
+        self._times = _Times(profile, pace)
 
     def plan(
         self,
@@ -296,7 +321,8 @@ class Planner:
         Raises
         ------
         InputError
-            Neither or both budgets, with no accuracy stated; an object that needs depth and no camera 2.
+            Neither or both budgets, with no accuracy stated; an object that needs depth and no camera 2; more
+            noise, or other optics, than errors were measured with.
         BudgetError
             No plan meets the budget: the nearest possible one is in the message and in `nearest`.
         """
@@ -305,6 +331,7 @@ class Planner:
         for name, value in (("max_error_um", max_error_um), ("max_ms", max_ms)):
             if value is not None:
                 require_positive(**{name: value})
+        self._require_measured(scene)
         wanted = [self._wanted_um(scene, thing, max_error_um, max_ms) for thing in scene.objects]
 
         def explained(plan: Plan, others: Sequence[Plan]) -> Plan:
@@ -354,7 +381,7 @@ class Planner:
 
     def predict_s(self, chain: Chain, features: int) -> float:
         """Return the predicted time of one object's chain while its filter stands."""
-        return self._times.chain(chain, features)
+        return self._times.chain(chain, features, self.profile.shape)
 
     def masks(self, scene: Scene) -> Iterator[Mask]:
         """Return the masks worth considering: none, and coded, focused between the objects and on each."""
@@ -379,6 +406,21 @@ class Planner:
 
     # ---- inside -------------------------------------------------------------------------------------------
 
+    def _require_measured(self, scene: Scene) -> None:
+        most = float(self._errors.noises[-1])
+        if scene.noise_grey > most:
+            raise InputError(
+                f"noise_grey is {scene.noise_grey:g}: errors were measured up to {most:.3g}, so use more "
+                "light or average frames"
+            )
+        optics = scene.optics
+        blur = optics.wavelength_um * optics.f_number / optics.object_pitch_um
+        if abs(math.log(blur / self.profile.blur_px)) > math.log(_OPTICS_ALIKE):
+            raise InputError(
+                f"the optics blur {blur:.3g} pixels (wavelength x f-number / pitch): errors were measured at "
+                f"{self.profile.blur_px:.3g}, and hold within a factor of {_OPTICS_ALIKE:g} of it"
+            )
+
     @staticmethod
     def _wanted_um(
         scene: Scene, thing: SceneObject, max_error_um: float | None, max_ms: float | None
@@ -400,6 +442,9 @@ class Planner:
     def choices(self, scene: Scene, mask: Mask, thing: SceneObject, wanted_um: float) -> list[Choice]:
         """Return every way to see an object under a mask that finds its features at all."""
         blur = _Defocus.of(scene.optics, mask, thing.depth_um, thing.depth_sigma_um)
+        drift_um = abs(thing.speed_um_per_s) / scene.frame_rate_hz
+        if drift_um > self._margin_um(mask, blur):
+            return []  # out of the mask's range before the next frame
         tolerance = self.tolerance_rad(scene.optics, mask, blur, wanted_um)
         firsts = [
             (chain, seconds + self._forming_s(scene, thing, chain, tolerance), error_um)
@@ -415,7 +460,6 @@ class Planner:
             ]
         choices = []
         tilt = math.radians(scene.tilt_deg)
-        drift_um = abs(thing.speed_um_per_s) / scene.frame_rate_hz
         for (chain, seconds, error_um), (second, more, error_2) in product(
             _unbeaten(firsts), _unbeaten(self._by_camera_2(scene, thing))
         ):
@@ -468,7 +512,7 @@ class Planner:
         kinds, errors = self._kinds(alpha_rad, blur, scene.noise_grey)
         pitch = scene.optics.object_pitch_um
         return [
-            (chain, self._times.chain(chain, thing.features), error_px * pitch)
+            (chain, self._times.chain(chain, thing.features, scene.shape), error_px * pitch)
             for (restoration, refine), error_px in zip(kinds, errors.tolist(), strict=True)
             if math.isfinite(error_px) and self._times.knows(restoration)
             for chain in (Chain(restoration, window, refine, TEMPLATE_PX, search),)
@@ -492,7 +536,7 @@ class Planner:
         drift_rad = abs(
             scene.optics.psi_rad(thing.depth_um + drift_um) - scene.optics.psi_rad(thing.depth_um)
         )
-        return self._times.form(chain) * min(1.0, drift_rad / tolerance_rad)
+        return self._times.form(chain, scene.shape) * min(1.0, drift_rad / tolerance_rad)
 
     def _most_precise(self, options: Sequence[Sequence[Choice]], most_s: float) -> list[Choice]:
         """Start with each object's quickest; refine the worst while time is left."""

@@ -16,11 +16,12 @@ import platformdirs
 import pydantic
 
 from adof_cl.errors import InputError
+from adof_cl.files import read_versioned
 from adof_cl.pipeline import Window
 from adof_cl.program import CACHE_VARIABLE
 from adof_cl.turns import Spread
 
-SCHEMA = 1
+SCHEMA = 2
 _INFINITE = pydantic.ConfigDict(ser_json_inf_nan="constants")  # a lost feature's error: written, not null
 _IDENTITY = ("name", "platform", "driver_version")
 
@@ -108,6 +109,10 @@ class Chain:
         return f"{self.restoration}, {where}, {self.refine}, {self.template_px} px in {self.search_px}"
 
 
+REFERENCE = Chain("float32", 160, "quadratic", TEMPLATE_PX, SEARCHES[0])
+"""One object, one feature: other chains' times are this one's and what they add; paces are taken from it."""
+
+
 @dataclass(frozen=True)
 class ChainTime:
     """Time of one object's chain for so many features."""
@@ -125,10 +130,8 @@ class ChainError:
     ----------
     alpha_rad, share
         The mask, and |psi|/(3 alpha); without a mask `share` is |psi| itself.
-    bias_px
-        Without noise: the farthest that any object's worst feature was off.
-    noise_px
-        What noise of `DeviceProfile.noise_grey` adds, in quadrature.
+    errors_px
+        The farthest that any object's worst feature was off, at each of `DeviceProfile.noises_grey`.
     """
 
     __pydantic_config__: ClassVar = _INFINITE
@@ -137,8 +140,7 @@ class ChainError:
     template_px: int
     alpha_rad: float
     share: float
-    bias_px: float
-    noise_px: float
+    errors_px: list[float]
 
 
 @dataclass(frozen=True)
@@ -166,8 +168,12 @@ class DeviceProfile:
         What a second object in the same frame does not pay again.
     mask_s
         Time to compute a mask's panel codes.
-    noise_grey, nsr
-        Noise of the frames on which `errors` were measured, and of the filters.
+    noises_grey, nsr
+        Noises of the frames on which `errors` were measured, the least first; and of the filters.
+    blur_px
+        lambda N over the object's pixel pitch, of the optics on which they were measured.
+    shape
+        Of the whole frame, (rows, columns).
     """
 
     schema_version: int
@@ -176,8 +182,10 @@ class DeviceProfile:
     device: dict[str, Any]
     machine: dict[str, Any]
     settings: dict[str, Any]
-    noise_grey: float
+    noises_grey: list[float]
     nsr: float
+    blur_px: float
+    shape: tuple[int, int]
     readings: list[Reading]
     times: list[ChainTime]
     forms: list[FormTime]
@@ -198,21 +206,7 @@ class DeviceProfile:
         InputError
             It cannot be read, or is not one of this version's.
         """
-        try:
-            profile = _PROFILE.validate_json(path.read_bytes())
-        except OSError as failure:
-            raise InputError(
-                f"{path} cannot be read ({failure.strerror}): write one with adof tradeoff --json FILE"
-            ) from failure
-        except pydantic.ValidationError as failure:
-            raise InputError(
-                f"{path} is not a device profile: give a file that adof tradeoff --json wrote"
-            ) from failure
-        if profile.schema_version != SCHEMA:
-            raise InputError(
-                f"{path} has schema version {profile.schema_version}, {SCHEMA} was wanted: measure it anew"
-            )
-        return profile
+        return read_versioned(path, _PROFILE, SCHEMA, "a device profile", "adof tradeoff --json FILE")
 
     @classmethod
     def of_device(cls, facts: dict[str, Any]) -> DeviceProfile:
@@ -230,6 +224,20 @@ class DeviceProfile:
             )
         return cls.read(path)
 
+    @property
+    def reference_s(self) -> float:
+        """Time of `REFERENCE` for one feature.
+
+        Raises
+        ------
+        InputError
+            It was not measured.
+        """
+        for timed in self.times:
+            if timed.chain == REFERENCE and timed.features == 1:
+                return timed.time_s.median
+        raise InputError("the profile holds no times to plan with: measure it anew with adof tradeoff")
+
     def fits(self, facts: dict[str, Any]) -> bool:
         """Whether it was measured on the device of these facts, with the same driver."""
         return all(self.device.get(key) == facts.get(key) for key in _IDENTITY)
@@ -238,7 +246,7 @@ class DeviceProfile:
 def kept_at(facts: dict[str, Any]) -> Path:
     """Return where the profile of a device with this driver is kept: beside its compiled kernels."""
     folder = Path(os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_path("adof-cl"))
-    identity = "\n".join(str(facts[key]) for key in _IDENTITY)
+    identity = "\n".join([str(SCHEMA), *(str(facts[key]) for key in _IDENTITY)])
     return folder / f"profile-{hashlib.sha256(identity.encode()).hexdigest()[:16]}.json"
 
 

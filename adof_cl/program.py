@@ -175,6 +175,7 @@ class Program:
             "-cl-std=CL1.2",
             # Oclgrind stops at an instruction its own optimiser writes.
             *(["-cl-opt-disable"] if device.facts.simulated else []),
+            *device.build_options,
             *options,
             *(_define(name, value) for name, value in sorted((defines or {}).items())),
         ]

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError, LimitError
-from adof_cl.optics import OpticalSystem, PupilGrid, SlmPanel
+from adof_cl.finite import checked_shape
+from adof_cl.optics import OpticalSystem, PupilGrid, SlmPanel, require_whole
 from adof_cl.program import Launch, Program
 
+_DARKEST = 1e-6  # stop, at its clearest
 LARGEST_SAMPLES = 4096
 """Cells across the stop; 8192 x 8192 complex numbers are half a gigabyte twice."""
 
@@ -44,12 +46,15 @@ def require_sampling(samples: int, alpha_rad: float, psi_rad: float) -> None:
     ------
     LimitError
         Fewer cells than eq. O9 asks.
+    InputError
+        Not finite.
     """
+    require_whole(samples=samples)
     wanted = PupilGrid.nyquist_samples(alpha_rad, psi_rad)
     if samples < wanted:
         raise LimitError(
             f"{samples} cells across the stop are too few for alpha {alpha_rad:g} and psi {psi_rad:g}: "
-            f"at least {math.ceil(wanted)} are needed"
+            f"at least {wanted:.0f} are needed"
         )
 
 
@@ -117,7 +122,8 @@ class Psf:
         precision: str = "float32",
     ) -> None:
         PupilGrid(samples)
-        if samples & (samples - 1) or padding < 2 or padding & (padding - 1):
+        whole = isinstance(padding, (int, np.integer)) and padding >= 2
+        if samples & (samples - 1) or not whole or padding & (padding - 1):
             raise InputError(f"samples is {samples}, padding {padding}: powers of two from 2 were wanted")
         if samples > LARGEST_SAMPLES:
             raise LimitError(
@@ -129,9 +135,9 @@ class Psf:
         if amplitude.shape != (samples, samples):
             raise InputError(f"stop has shape {amplitude.shape}: ({samples}, {samples}) was wanted")
         power = float((amplitude**2).sum())
-        if not (math.isfinite(power) and power > 0):
+        if not (amplitude.min() >= 0 and _DARKEST <= amplitude.max() <= 1):
             raise InputError(
-                "stop holds NaN or infinity, or lets no light through: amplitudes 0 to 1 were wanted"
+                "stop holds NaN, lets no light through, or amplitudes beyond 0 to 1: only those were wanted"
             )
         self.samples = samples
         self.size = m = padding * samples
@@ -180,7 +186,8 @@ class Psf:
         Parameters
         ----------
         turns : (samples, samples) real
-            Phase over the stop in turns, as `pupil_phase.PupilPhase` or `panel_turns` gives it.
+            Phase over the stop in turns, as `pupil_phase.PupilPhase` or `panel_turns` gives it. It must be
+            finite: it lies on the device and is not checked.
         alpha_rad, psi_rad
             The strength it stands for, so that a stop too coarse for it is refused.
 
@@ -264,7 +271,13 @@ class Psf:
         Returns
         -------
         shape complex128, DC at [0, 0].
+
+        Raises
+        ------
+        InputError
+            Not two whole numbers of 1 or more.
         """
+        shape = checked_shape("shape", shape)
         psf = self.psf.download().astype(np.float64)
         step = np.asarray(np.fft.fftfreq(self.size) * self.samples, dtype=np.float64)  # s of each sample
         rows, columns = (_transform(optics, n, step) for n in shape)

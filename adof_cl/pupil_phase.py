@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError
-from adof_cl.optics import Mask, PupilGrid, require_finite
-from adof_cl.phase_terms import require_envelope, split, split_turns, wrapped_turns
+from adof_cl.optics import Mask, PupilGrid, require_whole
+from adof_cl.phase_terms import require_envelope, require_tilt, split, split_turns, wrapped_turns
 from adof_cl.program import Program
 
 
@@ -36,8 +36,7 @@ class PupilPhase:
     """
 
     def __init__(self, device: Device, rows: int, columns: int, *, precision: str = "float32") -> None:
-        if min(rows, columns) < 1:
-            raise InputError(f"{rows} x {columns} pupil samples came: at least 1 x 1 was wanted")
+        require_whole(rows=rows, columns=columns)
         self._device = device
         self._real = device.real_type(precision)
         self._shape = (rows, columns)
@@ -85,6 +84,8 @@ class PupilPhase:
         ------
         InputError
             Wrong length, NaN or infinity.
+        LimitError
+            Beyond 1e6 rad.
         """
         for launch, profile, n, name in zip(
             self._axis_launches, (x_rad, y_rad), self._shape[::-1], ("x_rad", "y_rad"), strict=True
@@ -100,6 +101,8 @@ class PupilPhase:
         ------
         InputError
             Wrong shape, NaN or infinity.
+        LimitError
+            Beyond 1e6 rad.
         """
         if map_rad is not None:
             self._launch.set(2, self._device.upload(self._turns(map_rad, self._shape, "map_rad")))
@@ -114,8 +117,8 @@ class PupilPhase:
             Not finite, or beyond the measured range.
         """
         alpha, psi = require_envelope(mask.alpha_rad, mask.focus_psi_rad)
-        require_finite(tilt_x_rad=tilt_xy_rad[0], tilt_y_rad=tilt_xy_rad[1])
-        for launch, tilt in zip(self._axis_launches, tilt_xy_rad, strict=True):
+        tilts = require_tilt(tilt_xy_rad)
+        for launch, tilt in zip(self._axis_launches, tilts, strict=True):
             numbers = [part for value in (tilt, psi, alpha) for part in split_turns(value, self._real)]
             for index, number in enumerate(numbers, start=5):
                 launch.set(index, number)

@@ -21,6 +21,36 @@ Image = NDArray[np.generic]
 
 
 @dataclass(frozen=True)
+class Latency:
+    """From the end of an exposure to the command that came of it, stage by stage.
+
+    Attributes
+    ----------
+    frame_ms
+        From the end of the exposure until both cameras' frames were here: readout, transport, waiting.
+    features_ms
+        Until both frames were restored, the parts measured and triangulated.
+    law_ms
+        Until the law had decided, the next mask with it.
+    command_ms
+        Until the stages had acknowledged the command; NaN where there was nothing to command.
+    """
+
+    frame_ms: float = math.nan
+    features_ms: float = math.nan
+    law_ms: float = math.nan
+    command_ms: float = math.nan
+
+    @property
+    def total_ms(self) -> float:
+        """All of it; NaN without a command."""
+        return self.frame_ms + self.features_ms + self.law_ms + self.command_ms
+
+
+LATENCIES = ("frame_ms", "features_ms", "law_ms", "command_ms", "total_ms")
+
+
+@dataclass(frozen=True)
 class Iteration:
     """One pass of the loop, frame to command.
 
@@ -61,6 +91,7 @@ class Iteration:
     epipolar_residual_px: float
     lost_features: int
     compute_ms: float
+    latency: Latency = Latency()
     hole_xy_px: tuple[float, float] = (math.nan, math.nan)
     hole_bias_px: tuple[float, float] = (math.nan, math.nan)
     true_error_x_um: float = math.nan
@@ -94,9 +125,20 @@ class Position:
 
 @dataclass
 class RunRecord:
-    """Everything one run measured, in the order it happened."""
+    """Everything one run measured, in the order it happened.
 
-    seed: int
+    Attributes
+    ----------
+    seed
+        Of the world; None where the world is real.
+    rig
+        What the rig's devices did, JSON-ready; empty on the twin.
+    real_time
+        Frames and commands took the time they take on the wire: latency counts. The twin's clock stands still
+        meanwhile.
+    """
+
+    seed: int | None
     device: str
     iterations: list[Iteration] = field(default_factory=list)
     positions: list[Position] = field(default_factory=list)
@@ -108,11 +150,19 @@ class RunRecord:
     final_error: dict[str, float] = field(default_factory=dict)
     contacts: int = 0
     wall_s: float = math.nan
+    rig: dict[str, Any] = field(default_factory=dict)
+    real_time: bool = False
 
     def metrics(self) -> dict[str, Any]:
         """Return what `metrics.json` holds."""
         times = [i.compute_ms for i in self.iterations]
         quantile = {"p50": 50, "p99": 99}
+        latency = {}
+        for stage in LATENCIES if self.real_time else ():
+            took = [getattr(i.latency, stage) for i in self.iterations if math.isfinite(i.latency.total_ms)]
+            latency[stage.removesuffix("_ms")] = {
+                k: float(np.percentile(took, q)) if took else None for k, q in quantile.items()
+            }
         return {
             "docked": self.docked,
             "end_state": self.end_state,
@@ -124,6 +174,7 @@ class RunRecord:
             "contacts_before_alignment": self.contacts,
             "iterations": len(self.iterations),
             "compute_ms": {k: float(np.percentile(times, q)) if times else None for k, q in quantile.items()},
+            **({"latency_ms": latency, "rig": self.rig} if self.real_time else {}),
             "lost_features": sum(i.lost_features for i in self.iterations),
             "positions": [p.as_dict() for p in self.positions],
             "device": self.device,

@@ -17,12 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adof_cl.errors import InputError, TrackingError
+from adof_cl.finite import finite_array
+from adof_cl.optics import require_positive
 
 Array = NDArray[np.float64]
 _FINE_PX, _COARSE_PX = 0.6, 4.0  # band both pictures are compared in: below is noise, above is shading
 _TURNS_RAD = np.radians(np.arange(-6.0, 6.01, 1.0))
 _FOUND = 0.35
 _PASSES = 3
+_WIDEST_PX, _FARTHEST_PX, _BRIGHTEST = 4096, 1e6, 1e16
 
 
 class Drawing(Protocol):
@@ -79,13 +82,27 @@ def as_seen(
 
     The part's origin lies `fraction_px` beyond a pixel's centre, by default on one. Returns the picture,
     where it is judged (uint8, 0 or 1), and where the part's origin lies in it, (x, y).
+
+    Raises
+    ------
+    InputError
+        A matrix or a fraction that is not finite, or a picture narrower than a pixel or wider than 4096.
     """
+    matrix = finite_array("matrix", matrix, (2, 2))
     rows, columns = drawing.radiance.shape
     finer = 4
     centre = np.array(drawing.centre_yx[::-1])
     corners = np.array([[x, y] for x in (0, columns - 1) for y in (0, rows - 1)]) - centre
     seen = corners * drawing.pitch_um @ matrix.T
-    at = np.zeros(2) if fraction_px is None else fraction_px
+    extent = np.ptp(seen, axis=0)
+    if extent.min() < 1 or extent.max() > _WIDEST_PX:
+        raise InputError(
+            f"the drawing would be {extent[0]:.3g} x {extent[1]:.3g} pixels: 1 to {_WIDEST_PX} a side were "
+            "wanted, so check the matrix's unit"
+        )
+    at = np.zeros(2) if fraction_px is None else finite_array("fraction_px", fraction_px, (2,))
+    if np.abs(at).max() > 1:
+        raise InputError(f"fraction_px is {at.tolist()}: at most a pixel either way was wanted")
     low = np.floor(seen.min(axis=0) + at).astype(int) - 1
     size = np.ceil(seen.max(axis=0) + at).astype(int) + 2 - low
     to_fine = finer * matrix * drawing.pitch_um
@@ -127,12 +144,22 @@ def register(
     Raises
     ------
     InputError
-        Not a grey picture.
+        Not a grey picture of finite levels, or a matrix or place that cannot be.
     TrackingError
         Nothing there resembles the drawing.
     """
-    if image.ndim != 2:
+    if image.ndim != 2 or not image.size or image.dtype.kind not in "fiu":
         raise InputError(f"an image of shape {image.shape} came: a grey picture was wanted")
+    if not np.abs(image, dtype=np.float64).max() <= _BRIGHTEST:  # NaN neither
+        raise InputError(f"the image holds NaN, infinity or levels beyond {_BRIGHTEST:g}: take it anew")
+    matrix = finite_array("matrix", matrix, (2, 2))
+    require_positive(reach_px=reach_px)
+    if expected_px is not None:
+        expected_px = finite_array("expected_px", expected_px, (2,))
+        if max(float(np.abs(expected_px).max()), reach_px) > _FARTHEST_PX:
+            raise InputError(
+                f"expected_px or reach_px exceeds {_FARTHEST_PX:g} px: a nearer place was wanted"
+            )
     soft = _band(image.astype(np.float32))
     best = (-1.0, np.eye(2), np.zeros(2))
     for turn in _TURNS_RAD:

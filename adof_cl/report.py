@@ -12,7 +12,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,8 @@ def _trajectory(record: RunRecord) -> Figure:
     """Draw the hole's path in space, as the paper's Fig. 9."""
     figure = _figure(10, 4.6)
     path = np.array([i.true_hole_xyz_um for i in record.iterations])
+    if not np.isfinite(path).any():  # nobody knows: the path as seen from the peg
+        path = np.array([(-i.error_x_um, -i.error_y_um, i.hole_depth_um) for i in record.iterations])
     depth = np.array([i.hole_depth_um for i in record.iterations])
     from_above, over_depth = figure.subplots(1, 2)
     from_above.plot(path[:, 0], path[:, 1], ".-", ms=3, lw=1)
@@ -153,6 +155,40 @@ def _frames(record: RunRecord) -> Figure:
     return figure
 
 
+_STAGES = {
+    "frame_ms": "exposure's end → frames here",
+    "features_ms": "restored, tracked",
+    "law_ms": "law, next mask",
+    "command_ms": "command acknowledged",
+}
+
+
+def _latency(record: RunRecord) -> Figure:
+    """Draw how old each command's frame was, stage by stage, and how often."""
+    figure = _figure(10, 4.2)
+    over_time, ranked = figure.subplots(1, 2, width_ratios=(2, 1))
+    commanded = [i for i in record.iterations if math.isfinite(i.latency.total_ms)]
+    time = np.array([i.time_s - record.iterations[0].time_s for i in commanded])
+    took = np.array([[getattr(i.latency, stage) for stage in _STAGES] for i in commanded]).reshape(-1, 4)
+    over_time.stackplot(time, took.T, labels=_STAGES.values(), step="post", linewidth=0)
+    total = np.sort(took.sum(axis=1))
+    # A stall of the computer shows in the ranks; here it would hide all the rest.
+    over_time.set(
+        xlabel="time since the first frame (s)", ylabel="from exposure to command (ms)",
+        ylim=(0, 1.6 * float(np.percentile(total, 95)) if total.size else 1),
+    )  # fmt: skip
+    over_time.legend(loc="upper right", fontsize=8)
+    ranked.semilogx(np.maximum(total, 0.1), (np.arange(total.size) + 0.5) / max(total.size, 1))
+    ranked.set(xlabel="from exposure to command (ms)", ylabel="share of commands as quick", ylim=(0, 1))
+    ticks = [
+        t for t in (5, 10, 20, 50, 100, 200, 500, 1000) if total.size and total[0] / 2 < t < 2 * total[-1]
+    ]
+    ranked.set_xticks(ticks, [str(t) for t in ticks])
+    ranked.minorticks_off()
+    ranked.grid(alpha=0.3)
+    return figure
+
+
 _FIGURES: dict[str, tuple[str, Callable[[RunRecord], Figure]]] = {
     "trajectory.png": ("Trajectory of the hole", _trajectory),
     "mask_and_depth.png": ("Mask and depth", _mask_and_depth),
@@ -191,7 +227,7 @@ def write_report(record: RunRecord, folder: Path, extra_html: str = "") -> Path:
     parts = [
         "<!doctype html><meta charset='utf-8'><title>adof run</title>",
         f"<style>{_STYLE}</style>",
-        f"<h1>adof run, seed {record.seed}: "
+        f"<h1>adof run{'' if record.seed is None else f', seed {record.seed}'}: "
         f"<span class='{verdict}'>{html.escape(record.end_state)}</span></h1>",
         f"<p>{html.escape(record.device)}; {len(record.iterations)} iterations.</p>",
         _table(
@@ -220,8 +256,12 @@ def write_report(record: RunRecord, folder: Path, extra_html: str = "") -> Path:
         ]  # fmt: skip
         parts.append(_table(headings, rows))
     parts.append(extra_html)
+    figures = dict(_FIGURES)
+    if record.real_time:
+        parts.append(_measured(metrics))
+        figures["latency.png"] = ("From exposure to command", _latency)
     if record.iterations:
-        for name, (title, draw) in _FIGURES.items():
+        for name, (title, draw) in figures.items():
             with whole_file(folder / name) as temporary:
                 draw(record).savefig(temporary, dpi=110)
             encoded = base64.b64encode((folder / name).read_bytes()).decode()
@@ -236,6 +276,27 @@ def write_report(record: RunRecord, folder: Path, extra_html: str = "") -> Path:
     with whole_file(path) as temporary:
         temporary.write_text("\n".join(parts), encoding="utf-8")
     return path
+
+
+def _measured(metrics: dict[str, Any]) -> str:
+    """Return what was measured on a rig: latency by stage, and what its devices did."""
+    named = {stage.removesuffix("_ms"): title for stage, title in _STAGES.items()} | {"total": "all of it"}
+    latency = metrics["latency_ms"]
+    parts = [
+        _table(
+            ["exposure to command", "p50 (ms)", "p99 (ms)"],
+            [[title, latency[stage]["p50"], latency[stage]["p99"]] for stage, title in named.items()],
+        )
+    ]
+    if cameras := metrics["rig"].get("cameras"):
+        frames = [[name, cameras[name]] for name in ("camera 1", "camera 2")]
+        parts.append(
+            _table([f"frames, {cameras['rate_hz']:.1f} pairs a second", "what became of them"], frames)
+        )
+    if stop := metrics["rig"].get("stop"):
+        rows = [["stop sent", stop["pressed_to_sent_ms"]], ["everything at rest", stop["pressed_to_rest_ms"]]]
+        parts.append(_table(["after the pedal was pressed", "ms"], rows))
+    return "".join(parts)
 
 
 def _milli(value: float | None) -> float | None:

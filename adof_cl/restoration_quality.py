@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adof_cl.errors import InputError
+from adof_cl.finite import TRANSFER_LIMIT, checked_shape, require_transfer
 from adof_cl.noise import checked_nsr
 from adof_cl.optics import require_positive
 
@@ -69,17 +70,21 @@ def restoration_quality(
     Raises
     ------
     InputError
-        Another shape, not finite, an OTF without light, or a negative nsr.
+        Another shape, not finite, an OTF above 1e3 anywhere or below 1e-3 at DC, or a negative nsr.
     """
-    ny, nx = padded
+    ny, nx = checked_shape("padded", padded)
     half = np.asarray(otf)
     if half.shape != (ny, nx // 2 + 1) or half.dtype.kind not in "fciu" or not np.isfinite(half).all():
         raise InputError(
             f"the OTF is {half.shape} {half.dtype}: finite numbers of shape {(ny, nx // 2 + 1)} were wanted"
         )
     half = half.astype(np.complex128)
-    if abs(half[0, 0]) == 0:
-        raise InputError("the OTF is 0 at DC: a blur that passes light was wanted")
+    require_transfer("the OTF", half)
+    if abs(half[0, 0]) < 1 / TRANSFER_LIMIT:
+        raise InputError(
+            f"the OTF is {abs(half[0, 0]):g} at DC: a blur that passes {1 / TRANSFER_LIMIT:g} or more of the "
+            "light was wanted"
+        )
     power = np.abs(half) ** 2
     noise = checked_nsr(nsr, (ny, nx // 2 + 1))
     seen = power > 0

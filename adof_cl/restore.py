@@ -23,12 +23,15 @@ from adof_cl.errors import InputError, LimitError
 from adof_cl.fft_passes import Passes, pass_lists
 from adof_cl.finite import require_transfer
 from adof_cl.noise import NSR_LIMIT, checked_nsr
+from adof_cl.optics import require_whole
 from adof_cl.padding import checked_frame_shape, padded_shape, padding_weights
 from adof_cl.program import Argument, Launch, Program, vector_bytes
 
 FAMILIES = ("lanes", "groups")
 GAIN_LIMIT = 1e15
 """Largest gain of a filter: what no 16-bit frame of 16384 x 16384 can carry beyond float32."""
+FRAME_LIMIT = 1e15
+"""Largest level of a frame of reals for an image of integers: its sum, times `GAIN_LIMIT`, fits float32."""
 
 _HALF_LARGEST = 65504.0
 
@@ -455,7 +458,7 @@ class Restore:
             (ny + nx,) or (k, ny + nx), complex of this plan's precision: h_rows, then h_cols, with real
             Nyquist bins, as `OtfTable.out` holds them; its values are not checked.
         nsr
-            A number, or (ny, nx // 2 + 1) real on the device.
+            A number, or (ny, nx // 2 + 1) real on the device, not checked either.
         entry
             Which row of a (k, n) table to take.
 
@@ -480,6 +483,7 @@ class Restore:
                 f"the table is {table.shape} {table.dtype}, ({ny + nx},) or (k, {ny + nx}) {self._complex} "
                 "was wanted: sample the OTF of rows, then of columns, at the padded size"
             )
+        require_whole(0, entry=entry)
         entries = table.size // (ny + nx)
         if not 0 <= entry < entries:
             raise InputError(f"entry {entry} of the table was asked for: it has {entries}, counted from 0")
@@ -508,7 +512,7 @@ class Restore:
         ----------
         gain
             (ny, nx // 2 + 1) complex, DC at [0, 0]: what `numpy.fft.rfft2` of the padded frame is multiplied
-            by. On the device already, or on the host.
+            by. On the host, or on the device already, where its values are not checked.
 
         Raises
         ------
@@ -555,16 +559,27 @@ class Restore:
 
         Lines of the outer axis' other frequencies than 0 count half: the mean of a line of pixels from 0 to p
         times a turning unit is at most p/2. A filter's largest gain bounds the result from above.
+
+        Raises
+        ------
+        InputError
+            Another shape, or not finite.
         """
-        power = np.abs(gain).astype(np.float64) ** 2
+        ny, nx = self.padded_shape
+        if np.shape(gain) != (ny, nx // 2 + 1) or np.asarray(gain).dtype.kind not in "fciu":
+            raise InputError(f"the filter is {np.shape(gain)}: {(ny, nx // 2 + 1)} numbers were wanted")
+        modulus = np.abs(gain).astype(np.float64)
+        largest = float(modulus.max())
+        if not math.isfinite(largest):
+            raise InputError("the filter holds NaN or infinity: only finite gains can be applied")
+        power = (modulus / (largest or 1.0)) ** 2  # no square overflows
         if self._half_rows:
-            nx = self.padded_shape[1]
             counted = np.where((np.arange(nx // 2 + 1) % nx == 0) | (2 * np.arange(nx // 2 + 1) == nx), 1, 2)
             lines = power @ counted / nx
         else:
             lines = power.mean(axis=0)
         lines[1:] /= 4
-        return math.sqrt(float(lines.max()))
+        return largest * math.sqrt(float(lines.max()))
 
     # ---- frames -------------------------------------------------------------------------------------------
 
@@ -575,6 +590,8 @@ class Restore:
         ----------
         frame, out
             (rows, columns) of the plan's `in_dtype` and `out_dtype`; `out` may be `frame` if these agree.
+            A frame of reals must hold finite ones: one NaN or infinity makes every pixel of a real image NaN,
+            and an image of integers black. `restore` checks, this does not: it never waits for the device.
 
         Raises
         ------
@@ -592,6 +609,8 @@ class Restore:
 
     def transform(self, frame: DeviceArray) -> None:
         """Enqueue the first third alone, to `apply` several filters to one frame afterwards.
+
+        What a frame must hold: as for the call.
 
         Raises
         ------
@@ -636,14 +655,34 @@ class Restore:
                 f"the frame is {frame.shape} {frame.dtype}, this plan restores {self.shape} {self.in_dtype}: "
                 "convert it or make a plan for it"
             )
-        if frame.dtype.kind == "f" and not np.isfinite(frame).all():
-            raise InputError("the frame holds NaN or infinity: replace those pixels first")
+        self.require_frame(frame)
         if self._frame is None or self._image is None:
             self._frame = self.device.empty(self.shape, self.in_dtype)
             self._image = self.device.empty(self.shape, self.out_dtype)
         image = self(self._frame.upload(frame), self._image, slot).download()
         require_finite_image(image)
         return image
+
+    def require_frame(self, frame: NDArray[Any]) -> None:
+        """Refuse a frame on the host, of the plan's `in_dtype`, that would spoil its image.
+
+        Raises
+        ------
+        InputError
+            NaN or infinity in it.
+        LimitError
+            Levels beyond `FRAME_LIMIT` where the image is of integers, which could not say it overflowed.
+        """
+        if frame.dtype.kind != "f":
+            return
+        largest = max(float(frame.max()), -float(frame.min()))
+        if not math.isfinite(largest):
+            raise InputError("the frame holds NaN or infinity: replace those pixels first")
+        if self.out_dtype.kind == "u" and largest > FRAME_LIMIT:
+            raise LimitError(
+                f"the frame reaches {largest:g}: an image of {self.out_dtype} wants levels of at most "
+                f"{FRAME_LIMIT:g}, so scale the frame down"
+            )
 
     # ---- inside -------------------------------------------------------------------------------------------
 
@@ -761,6 +800,5 @@ def require_finite_image(image: NDArray[Any]) -> None:
 
 
 def _checked_slot(slot: int) -> int:
-    if slot != int(slot) or slot < 0:
-        raise InputError(f"slot is {slot}: a whole number from 0 on was wanted")
+    require_whole(0, slot=slot)
     return int(slot)

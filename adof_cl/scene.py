@@ -14,7 +14,8 @@ from typing import ClassVar
 import pydantic
 
 from adof_cl.errors import InputError
-from adof_cl.optics import Mask, OpticalSystem, require_finite, require_positive
+from adof_cl.finite import checked_shape
+from adof_cl.optics import Mask, OpticalSystem, require_finite, require_positive, require_whole
 
 _NOTHING_ELSE = pydantic.ConfigDict(extra="forbid")  # a misspelt name is said, not passed over
 
@@ -60,8 +61,7 @@ class SceneObject:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise InputError(f"{name} of '{self.name}' is {value}: a number of 0 or more was wanted")
-        if self.features < 1:
-            raise InputError(f"features of '{self.name}' is {self.features}: at least 1 was wanted")
+        require_whole(**{f"features of '{self.name}'": self.features})
         for values in (self.accuracy_um, self.depth_accuracy_um):
             for phase, value in values.items():
                 require_positive(**{f"accuracy of '{self.name}' in phase '{phase}'": value})
@@ -100,8 +100,13 @@ class Scene:
         if len(set(names)) < len(names):
             raise InputError(f"objects are called {', '.join(names)}: give each its own name")
         require_positive(frame_rate_hz=self.frame_rate_hz, noise_grey=self.noise_grey)
-        if min(self.shape) < 96:
-            raise InputError(f"shape is {self.shape}: at least 96 pixels a side were wanted")
+        checked_shape("shape", self.shape, 96)
+        for thing in self.objects:
+            if thing.extent_px > max(self.shape):
+                raise InputError(
+                    f"extent_px of '{thing.name}' is {thing.extent_px:g}: the frame has {self.shape[1]} x "
+                    f"{self.shape[0]} pixels, so follow features that lie closer together"
+                )
         if not 1 <= self.tilt_deg <= 90:
             raise InputError(f"tilt_deg is {self.tilt_deg}: 1 to 90 was wanted")
 

@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 QUARTER_TURN: Array = np.array([[0.0, -1.0], [1.0, 0.0]])
 JOG_LIMIT_RAD = math.radians(30)
 _AXES = ("x", "y", "theta", "z")
+_MOST_LATE = 1e6  # periods
+_LARGEST_RATIO = 1e60  # its square times another's square fits float64
 
 
 class ServoCamera(Protocol):
@@ -89,30 +91,51 @@ def damped_pseudo_inverse(matrix: ArrayLike, reference: float, damping: float = 
     Raises
     ------
     InputError
-        Not a finite matrix, or a reference or damping not above 0.
+        Not a finite matrix, a reference or damping not above 0, or numbers beyond 1e60 either way.
     """
     jacobian = finite_array("matrix", matrix, (None, None))
     require_positive(reference=reference, damping=damping)
+    largest = max(float(np.abs(jacobian).max()), reference, 1 / reference, damping)
+    if largest > _LARGEST_RATIO:
+        raise InputError(
+            f"matrix, reference or damping reaches {largest:g} or its inverse: at most {_LARGEST_RATIO:g} "
+            "was wanted, so choose other units"
+        )
     u, s, vt = np.linalg.svd(jacobian, full_matrices=False)
     mu2 = (damping * reference) ** 2 * np.maximum(1 - (s / reference) ** 2, 0)
     return np.asarray((vt.T * (s / (s**2 + mu2))) @ u.T)
 
 
 def rotation_sigma_rad(baseline_um: float, sigma_um: float) -> float:
-    """Return the error of a bearing measured between two features: sqrt(2) sigma / baseline (eq. C4)."""
+    """Return the error of a bearing measured between two features: sqrt(2) sigma / baseline (eq. C4).
+
+    At most pi: then nothing is known of it.
+    """
     require_positive(baseline_um=baseline_um, sigma_um=sigma_um)
-    return math.sqrt(2) * sigma_um / baseline_um
+    return min(math.sqrt(2) * sigma_um / baseline_um, math.pi)
 
 
 # ---- gain from delay --------------------------------------------------------------------------------------
 
 
 def samples_late(delay_s: float, period_s: float) -> int:
-    """Return d of e[k+1] = e[k] - g e[k-d]: whole periods between exposure and motion, rounded up."""
+    """Return d of e[k+1] = e[k] - g e[k-d]: whole periods between exposure and motion, rounded up.
+
+    Raises
+    ------
+    InputError
+        A period not above 0, a delay below 0, or one of more than a million periods.
+    """
     require_positive(period_s=period_s)
     if not (math.isfinite(delay_s) and delay_s >= 0):
         raise InputError(f"delay_s is {delay_s}: the measured age of a frame, 0 or more, was wanted")
-    return math.ceil(delay_s / period_s - 1e-9)
+    late = delay_s / period_s
+    if late > _MOST_LATE:
+        raise InputError(
+            f"delay_s is {delay_s:g} and period_s {period_s:g}: at most {_MOST_LATE:g} periods of delay were "
+            "wanted"
+        )
+    return math.ceil(late - 1e-9)
 
 
 def stability_limit_per_s(delay_s: float, period_s: float) -> float:
@@ -124,7 +147,7 @@ def stability_limit_per_s(delay_s: float, period_s: float) -> float:
 def gain_from_delay(delay_s: float, period_s: float) -> float:
     """Return the largest gain that does not overshoot: d^d / (d+1)^(d+1) / T (eq. C7)."""
     d = samples_late(delay_s, period_s)
-    return float(d**d / (d + 1) ** (d + 1)) / period_s
+    return (d / (d + 1)) ** d / (d + 1) / period_s
 
 
 def require_stable_gain(gain_per_s: float, delay_s: float, period_s: float) -> None:
@@ -258,12 +281,21 @@ class StageMove:
 
 
 def saturate(velocities: ArrayLike, limits: ArrayLike) -> Array:
-    """Return velocities scaled by one factor so that none exceeds its limit: the direction stays (eq. C5)."""
+    """Return velocities scaled by one factor so that none exceeds its limit: the direction stays (eq. C5).
+
+    Raises
+    ------
+    InputError
+        Another shape, NaN, limits not above 0, or velocities 1e308 times beyond them.
+    """
     wanted = finite_array("velocities", velocities, (None,))
     most = finite_array("limits", limits, (len(wanted),))
     if not np.all(most > 0):
         raise InputError(f"limits are {most.tolist()}: speeds above 0 were wanted")
-    excess = float((np.abs(wanted) / most).max())
+    with np.errstate(over="ignore"):
+        excess = float((np.abs(wanted) / most).max())
+    if not math.isfinite(excess):
+        raise InputError(f"velocities are {wanted.tolist()}, limits {most.tolist()}: too far apart to scale")
     return np.asarray(np.clip(wanted / max(excess, 1.0), -most, most))
 
 

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError, LimitError
-from adof_cl.optics import Mask, OpticalSystem, SlmPanel, require_finite
-from adof_cl.phase_terms import require_envelope, split, split_turns, wrapped_turns
+from adof_cl.optics import Mask, OpticalSystem, SlmPanel
+from adof_cl.phase_terms import require_envelope, require_tilt, split, split_turns, wrapped_turns
 from adof_cl.program import Program
 
 _RECALLED = "from memory, not checked against a data sheet"
+_LARGEST_STROKE_RAD = 20 * math.pi
 _STROKE = "a full turn of stroke is assumed: measure yours at your wavelength and use with_stroke()"
 
 PANELS: dict[str, SlmPanel] = {
@@ -85,10 +86,17 @@ def stroke_table(stroke_rad: float) -> NDArray[np.uint8]:
     stroke_rad
         Phase between code 0 and code 255.
 
+    Raises
+    ------
+    InputError
+        Not above 0, or more than ten turns.
+
     Source
     ------
     docs/maths.md, eq. E3.
     """
+    if not 0 < stroke_rad <= _LARGEST_STROKE_RAD:
+        raise InputError(f"stroke_rad is {stroke_rad}: above 0 and at most ten turns was wanted")
     phase = 2 * math.pi * np.arange(256) / 256
     codes = np.rint(255 * phase / stroke_rad)
     beyond = np.where(phase - stroke_rad <= 2 * math.pi - phase, 255.0, 0.0)
@@ -118,7 +126,7 @@ class SlmEncode:
     Raises
     ------
     LimitError
-        The stop is wider than the panel.
+        The stop is wider than the panel, or a correction beyond 1e6 rad.
     InputError
         Table or correction of another shape, or not finite.
 
@@ -197,7 +205,7 @@ class SlmEncode:
 
     def step_rad(self, mask: Mask, tilt_xy_rad: tuple[float, float] = (0.0, 0.0)) -> float:
         """Return the largest phase step from one pixel to the next (eq. E4)."""
-        tilt = max(abs(t) for t in tilt_xy_rad)
+        tilt = max(abs(t) for t in require_tilt(tilt_xy_rad))
         slope = 3 * abs(mask.alpha_rad) + 2 * abs(mask.focus_psi_rad) + tilt
         return slope * 2 / self._across + self._correction_step
 
@@ -214,7 +222,6 @@ class SlmEncode:
             Not finite.
         """
         alpha, psi = require_envelope(mask.alpha_rad, mask.focus_psi_rad)
-        require_finite(tilt_x_rad=tilt_xy_rad[0], tilt_y_rad=tilt_xy_rad[1])
         step = self.step_rad(mask, tilt_xy_rad)
         if step > math.pi:
             strongest = math.pi * self._across / 6

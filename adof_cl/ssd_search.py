@@ -11,10 +11,15 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError, TrackingError
+from adof_cl.finite import checked_shape
+from adof_cl.optics import require_whole
 from adof_cl.program import Launch, Program, require_local_memory, vector_bytes
 
 LARGEST_TEMPLATE = 64
 """Longest side of a template: up to here uint8 sums are exact in every family (docs/maths.md, eq. S3)."""
+LARGEST_LEVEL = 1e16
+"""Largest level of a template: the squares of its 4096 differences from as bright an image fit float32."""
+_LEAST_VARIANCE = 1e-30  # as in kernels/ssd_search.cl
 
 _IMAGE_KINDS = {np.dtype(np.uint8): 0, np.dtype(np.uint16): 1, np.dtype(np.float32): 2}
 # Offset rows x vectors that a work-item of the lanes family computes at once: their sums stay in registers.
@@ -39,6 +44,8 @@ class SearchResult:
         row-major order.
     score : (count,) float64
         The smallest score. "ssd": squared grey levels; an exact integer for uint8. "gain_offset": 0 to 1.
+        Infinite where the image holds NaN, infinity or levels beyond 1e16 in every footprint of the window,
+        which match nothing.
     neighbourhood : (count, 3, 3) float64
         Scores around the best place; infinite where the search window ends.
     patches : (count, rows, columns) float32, or None
@@ -104,9 +111,9 @@ class SsdSearch:
         family: str | None = None,
     ) -> None:
         self.device = device
-        self.image_shape = _shape("image_shape", image_shape)
-        self.template_shape = _shape("template_shape", template_shape)
-        self.search_shape = _shape("search_shape", search_shape)
+        self.image_shape = checked_shape("image_shape", image_shape)
+        self.template_shape = checked_shape("template_shape", template_shape)
+        self.search_shape = checked_shape("search_shape", search_shape)
         self.count = count
         self.dtype = np.dtype(dtype)
         self.score = score
@@ -201,8 +208,9 @@ class SsdSearch:
             )
 
     def _check(self) -> None:
-        if self.count < 1:
-            raise InputError(f"count is {self.count}: at least 1 template was wanted")
+        require_whole(count=self.count)
+        if self.patch_margin is not None:
+            require_whole(0, patch_margin=self.patch_margin)
         if self.dtype not in _IMAGE_KINDS:
             raise InputError(f"dtype is {self.dtype}: choose uint8, uint16 or float32")
         if self.score not in ("ssd", "gain_offset"):
@@ -233,9 +241,10 @@ class SsdSearch:
         Raises
         ------
         InputError
-            Another shape or type, or a value that is not finite.
+            Another shape or type, or a value that is not finite or beyond `LARGEST_LEVEL`.
         TrackingError
-            A template of one grey level under score "gain_offset".
+            A template without contrast under score "gain_offset": of one grey level, or squared differences
+            from its mean that sum to less than 1e-30. No template is changed then.
         """
         wanted = (self.count, *self.template_shape)
         if templates.shape != wanted or templates.dtype != self.dtype:
@@ -243,6 +252,8 @@ class SsdSearch:
                 f"templates of shape {templates.shape} and type {templates.dtype} came, {wanted} "
                 f"{self.dtype} was wanted: convert them first"
             )
+        for index, pixels in enumerate(templates):
+            self._require_template(index, pixels)
         for index, pixels in enumerate(templates):
             self._prepare(index, pixels)
         self._templates_on_device.upload(self._values)
@@ -257,18 +268,26 @@ class SsdSearch:
                 f"a template of shape {pixels.shape} and type {pixels.dtype} came, {self.template_shape} "
                 f"{self.dtype} was wanted: convert it first"
             )
+        self._require_template(index, pixels)
         self._prepare(index, pixels)
         self._templates_on_device.upload(self._values)
         self._sums_on_device.upload(self._sums)
 
-    def _prepare(self, index: int, pixels: NDArray[Any]) -> None:
+    def _require_template(self, index: int, pixels: NDArray[Any]) -> None:
         values = pixels.astype(np.float64)
-        if not np.isfinite(values).all():
-            raise InputError(f"template {index} holds a value that is not finite: give it finite pixels")
-        if self.score == "gain_offset" and values.min() == values.max():
+        largest = float(np.abs(values).max())
+        if not largest <= LARGEST_LEVEL:  # NaN neither
+            raise InputError(
+                f"template {index} holds a value of {largest:g}: finite levels of at most {LARGEST_LEVEL:g} "
+                "were wanted, whose squares a search can sum"
+            )
+        if self.score == "gain_offset" and float(((values - values.mean()) ** 2).sum()) < _LEAST_VARIANCE:
             raise TrackingError(
                 f"template {index} is one grey level, {values.flat[0]:g}: choose one with texture"
             )
+
+    def _prepare(self, index: int, pixels: NDArray[Any]) -> None:
+        values = pixels.astype(np.float64)
         if self.dtype == np.uint8:
             self._sums[index] = int(values.sum()), int((values * values).sum())
         elif self.score == "gain_offset":
@@ -313,6 +332,8 @@ class SsdSearch:
 
     def __call__(self, image: DeviceArray) -> None:
         """Enqueue one search of `image` (`image_shape`, `dtype`); fetch the result before the next.
+
+        NaN, infinity and levels beyond 1e16 need no check: a footprint that holds one matches nothing.
 
         Raises
         ------
@@ -407,9 +428,3 @@ def _share(total: int, most: int, unit: int) -> int:
     """Return the size of equal parts of `total`, the fewest of at most `most`, in whole units."""
     parts = -(-total // max(most // unit * unit, unit))
     return _multiple(-(-total // parts), unit)
-
-
-def _shape(name: str, shape: tuple[int, int]) -> tuple[int, int]:
-    if len(shape) != 2 or min(shape) < 1:
-        raise InputError(f"{name} is {tuple(shape)}: (rows, columns), each at least 1, was wanted")
-    return int(shape[0]), int(shape[1])

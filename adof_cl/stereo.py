@@ -34,6 +34,8 @@ REFUSE_ANGLE_RAD = math.radians(5)
 WARN_ANGLE_RAD = math.radians(15)
 MINIMUM_POINTS = 6
 _FARTHEST_STEP_UM = 1e6
+_FARTHEST = 1e12  # of points in um and of pixels, either way
+_SMALLEST_SIGMA_PX, _LARGEST_SIGMA_PX = 1e-6, 1e6
 _AXES = "xyz"
 _FLAT = 1e-6  # points this flat, against their width, lie in a plane: 3 nm on 3 mm
 
@@ -373,17 +375,26 @@ def _whitening(n: int, sigma_px: ArrayLike, covariance_px2: ArrayLike | None) ->
         _require_covariances("covariance_px2", covariance)
         return np.linalg.inv(np.linalg.cholesky(covariance))
     sigma = finite_array("sigma_px", sigma_px, () if np.ndim(sigma_px) == 0 else (n,))
-    if not np.all(sigma > 0):
-        raise InputError(f"sigma_px is {float(np.min(sigma))}: noise above 0 was wanted")
+    if not np.all((sigma >= _SMALLEST_SIGMA_PX) & (sigma <= _LARGEST_SIGMA_PX)):
+        raise InputError(
+            f"sigma_px is {float(np.min(sigma)):g} to {float(np.max(sigma)):g}: noise above 0, of "
+            f"{_SMALLEST_SIGMA_PX:g} to {_LARGEST_SIGMA_PX:g} px, was wanted"
+        )
     return np.asarray(1 / np.broadcast_to(sigma, n))
 
 
 def _require_covariances(name: str, covariance: Array) -> None:
     symmetric = np.allclose(covariance, covariance.swapaxes(-1, -2), rtol=1e-6, atol=0)
-    smallest = float(np.linalg.eigvalsh(covariance)[..., 0].min()) if symmetric else 0.0
-    if not smallest > 0:
+    values = np.linalg.eigvalsh(covariance) if symmetric else np.zeros((1, 2))
+    if not values[..., 0].min() > 0:
         raise InputError(
             f"{name} is not symmetric and positive definite: give the covariance of (x, y) in px^2"
+        )
+    # Weighing one against the other must not lose all digits of what is seen well.
+    if values.max() > _LARGEST_SIGMA_PX**2 or values.min() < _SMALLEST_SIGMA_PX**2:
+        raise InputError(
+            f"{name} holds variances of {values.min():.3g} to {values.max():.3g} px^2: "
+            f"{_SMALLEST_SIGMA_PX**2:g} to {_LARGEST_SIGMA_PX**2:g} was wanted; leave out what was not seen"
         )
 
 
@@ -424,7 +435,7 @@ def calibrate_camera(
     Raises
     ------
     InputError
-        Wrong shapes, NaN, noise not above 0.
+        Wrong shapes, NaN, noise beyond 1e-6 to 1e6 px, points or pixels beyond 1e12.
     CalibrationError
         Too few points, or the predicted error over the work volume exceeds `sigma_limit_um`; says which
         direction is unconstrained and which move mends it.
@@ -437,6 +448,9 @@ def calibrate_camera(
     n = len(points)
     pixels = finite_array("pixels_xy", pixels_xy, (n, 2))
     require_positive(sigma_limit_um=sigma_limit_um)
+    for name, values in (("points_um", points), ("pixels_xy", pixels)):
+        if np.abs(values).max() > _FARTHEST:
+            raise InputError(f"{name} reaches {np.abs(values).max():g}: at most {_FARTHEST:g} was wanted")
     if n < MINIMUM_POINTS:
         raise CalibrationError(
             f"{n} points came: at least {MINIMUM_POINTS} were wanted, so that a mismatch shows as residual"

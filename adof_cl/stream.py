@@ -14,10 +14,10 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Generic, Literal, Protocol, TypeVar
 
-import numpy as np
 from numpy.typing import NDArray
 
 from adof_cl.errors import AdofError, InputError, StreamError
+from adof_cl.optics import require_whole
 from adof_cl.restore import Restore, require_finite_image
 
 Item = TypeVar("Item")
@@ -383,8 +383,7 @@ class RestoredFrames:
     """
 
     def __init__(self, plan: Restore, *, slot: int = 0, buffers: int = 2) -> None:
-        if buffers < 1:
-            raise InputError(f"buffers is {buffers}: at least 1 was wanted")
+        require_whole(buffers=buffers)
         self.plan = plan
         self.slot = slot
         self.buffers = buffers
@@ -399,10 +398,11 @@ class RestoredFrames:
         ------
         InputError
             Another shape or type, NaN or infinity.
+        LimitError
+            A frame of reals too large for an image of integers.
         """
         self._frames[buffer].require_alike(frame)
-        if frame.dtype.kind == "f" and not np.isfinite(frame).all():
-            raise InputError("the frame holds NaN or infinity: replace those pixels first")
+        self.plan.require_frame(frame)
         self._frames[buffer].stage(frame)
 
     def enqueue(self, buffer: int) -> None:

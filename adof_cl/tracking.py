@@ -18,14 +18,16 @@ from scipy.fft import next_fast_len
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError, TrackingError
-from adof_cl.optics import OpticalSystem, require_finite, require_positive
-from adof_cl.ssd_search import SsdSearch
+from adof_cl.finite import checked_shape, finite_array
+from adof_cl.optics import OpticalSystem, require_positive, require_whole
+from adof_cl.ssd_search import LARGEST_LEVEL, SsdSearch
 
 Array = NDArray[np.float64]
 
 _CONTEXT = 8  # pixels around a patch: a spline's memory of its end fades as 0.27 a pixel
 # What each step of the ladder leaves of its own, px^2: whole pixels spread evenly, the quadratic's pull.
 _LEFT_PX2 = {"integer": 1 / 12, "quadratic": 0.03**2, "gauss_newton": 0.0}
+_SIGMA_LIMITS_PX = (1e-9, 1e9)  # that a template can be asked for
 _REACH_PX = 1.5  # a refinement that goes farther has left the match it started from
 # White noise of variance 1 has a spline derivative of this variance: 9 (2/sqrt(3) - 1), eq. S11.
 _DERIVATIVE_NOISE = 9 * (2 / math.sqrt(3) - 1)
@@ -86,6 +88,8 @@ class TrackingLimits:
 
     def __post_init__(self) -> None:
         require_positive(mismatch=self.mismatch, sigma_px=self.sigma_px)
+        if len(self.gain) != 2:
+            raise InputError(f"gain limits are {self.gain}: the smallest and the largest were wanted")
         require_positive(gain_min=self.gain[0], gain_max=self.gain[1])
         if self.gain[0] >= self.gain[1]:
             raise InputError(f"gain limits are {self.gain}: the smaller first was wanted")
@@ -165,7 +169,7 @@ class Template:
         ------
         docs/maths.md, eqs. S10, S11 and S16; the paper's section 3.3 (templates are taken in focus).
         """
-        feature_yx = np.asarray(feature_xy_px, dtype=np.float64)[::-1]
+        feature_yx = np.atleast_1d(np.asarray(feature_xy_px, dtype=np.float64))[::-1]
         if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16, np.float32):
             raise InputError(
                 f"an image of {image.ndim} axes and type {image.dtype} came, (rows, columns) of uint8, "
@@ -175,10 +179,10 @@ class Template:
             raise InputError(
                 f"feature_xy_px is {feature_yx[::-1].tolist()}: a finite column and row were wanted"
             )
-        if min(shape) < 4:
-            raise InputError(f"a template of {shape} came: at least 4 pixels a side were wanted")
+        size = np.array(checked_shape("a template's shape", shape, 4))
         require_positive(sigma_limit_px=sigma_limit_px)
-        size = np.array(shape)
+        if not _SIGMA_LIMITS_PX[0] <= sigma_limit_px <= _SIGMA_LIMITS_PX[1]:
+            raise InputError(f"sigma_limit_px is {sigma_limit_px:g}: 1e-9 to 1e9 was wanted")
         corner = np.rint(feature_yx - (size - 1) / 2).astype(np.int64)
         if (corner < 0).any() or (corner + size > image.shape).any():
             raise InputError(
@@ -188,11 +192,15 @@ class Template:
         low = np.maximum(corner - _CONTEXT, 0)
         high = np.minimum(corner + size + _CONTEXT, image.shape)
         around = image[low[0] : high[0], low[1] : high[1]].astype(np.float64)
-        if not np.isfinite(around).all():
-            raise InputError("the image holds values that are not finite around the feature: restore it anew")
+        if not np.abs(around).max() <= LARGEST_LEVEL:  # NaN neither
+            raise InputError(
+                f"the image holds values that are not finite or beyond {LARGEST_LEVEL:g} around the feature: "
+                "restore it anew"
+            )
         if noise is None:
             noise = estimate_noise(around)
-        require_finite(noise=noise)
+        if not 0 <= noise <= LARGEST_LEVEL:
+            raise InputError(f"noise is {noise}: 0 to {LARGEST_LEVEL:g} grey levels were wanted")
         quantum = 1 / math.sqrt(12) if image.dtype != np.float32 else float(np.finfo(np.float32).eps)
         noise = max(noise, quantum)
 
@@ -234,12 +242,13 @@ class Template:
         )
 
     def anchored(self, anchor_yx: ArrayLike) -> Template:
-        """Return the same picture with the feature at another place in it."""
-        return replace(self, anchor_yx=np.asarray(anchor_yx, dtype=np.float64))
+        """Return the same picture with the feature at another place in it, two finite numbers."""
+        return replace(self, anchor_yx=finite_array("anchor_yx", anchor_yx, (2,)))
 
 
 def extent_px(templates: Sequence[Template], corners_px: Array) -> float:
     """Return the side of the square about the features' middle that holds their templates' middles."""
+    corners_px = finite_array("corners_px", corners_px, (len(templates), 2))
     middle = (corners_px.min(axis=0) + corners_px.max(axis=0)) / 2
     shape = np.array(templates[0].pixels.shape)
     offsets = [
@@ -255,9 +264,16 @@ def estimate_noise(image: NDArray[Any]) -> float:
     Source
     ------
     Immerkaer, Computer Vision and Image Understanding 64 (1996) 300, with the median in place of the mean.
+
+    Raises
+    ------
+    InputError
+        Smaller than 3 x 3, NaN or infinity.
     """
     if image.ndim != 2 or min(image.shape) < 3:
         raise InputError(f"an image of shape {image.shape} came: at least 3 x 3 pixels were wanted")
+    if image.dtype.kind not in "fiu" or not np.isfinite(image).all():
+        raise InputError("the image holds NaN, infinity or no numbers: replace those pixels first")
     second = np.diff(image.astype(np.float64), 2, axis=0)
     mixed = np.diff(second, 2, axis=1)
     # The mask's weights have squares that sum to 36; 0.6745 is the median of |N(0, 1)|.
@@ -361,6 +377,8 @@ def quadratic_minimum(neighbourhood: Array) -> Array:
     neighbourhood : (..., 3, 3)
     """
     s = np.asarray(neighbourhood, dtype=np.float64)
+    if s.shape[-2:] != (3, 3):
+        raise InputError(f"neighbourhood is {s.shape}: (..., 3, 3) scores were wanted")
     finite = np.asarray(np.isfinite(s).all(axis=(-2, -1)))
     s = np.where(finite[..., None, None], s, 0.0)
     gy = (s[..., 2, :] - s[..., 0, :]).sum(-1) / 6
@@ -441,7 +459,24 @@ class GaussNewton:
         ----------
         patches : (k, rows + 16, columns + 16)
             The image under each template at its whole-pixel place, and 8 pixels around.
+
+        Raises
+        ------
+        InputError
+            Other shapes, not finite, or a start farther than 1.5 px.
         """
+        wanted = (len(self._means), *(n + 2 * _CONTEXT for n in self.shape))
+        if patches.shape != wanted or patches.dtype.kind not in "fiu" or not math.isfinite(patches.sum()):
+            raise InputError(f"patches are {patches.shape}: finite levels of shape {wanted} were wanted")
+        if start_yx.shape != (wanted[0], 2) or start_yx.dtype.kind not in "fiu":
+            raise InputError(f"start_yx is {start_yx.shape} {start_yx.dtype}: {(wanted[0], 2)} was wanted")
+        if not -_REACH_PX <= start_yx.min() <= start_yx.max() <= _REACH_PX:
+            raise InputError(f"start_yx is {start_yx.tolist()}: at most {_REACH_PX} px either way was wanted")
+        require_whole(0, iterations=iterations)
+        return self.refined(patches, start_yx, iterations)
+
+    def refined(self, patches: NDArray[Any], start_yx: Array, iterations: int) -> Refinement:
+        """Refine as the call does, unchecked: for patches and starts that are known to fit."""
         coefficients = self._inverses[0] @ patches.astype(np.float64) @ self._inverses[1].T
         shift = start_yx.astype(np.float64)
         image, fit = self._fit(coefficients, shift)
@@ -558,7 +593,7 @@ class TemplateTracker:
         self.refine = checked_refine(refine)
         self.limits = limits or TrackingLimits()
         self.dtype = templates[0].pixels.dtype
-        self.full_scale = full_scale or _full_scale(self.dtype)
+        self.full_scale = _full_scale(self.dtype) if full_scale is None else full_scale
         require_positive(full_scale=self.full_scale)
         self.search = SsdSearch(
             device,
@@ -654,7 +689,7 @@ class TemplateTracker:
         if self.refine != "integer":
             start = quadratic_minimum(found.neighbourhood)
         patches = np.where(np.isfinite(found.patches), found.patches, 0.0)
-        refined = self._refiner(patches, start, 20 if self.refine == "gauss_newton" else 0)
+        refined = self._refiner.refined(patches, start, 20 if self.refine == "gauss_newton" else 0)
         inner = patches[:, _CONTEXT:-_CONTEXT, _CONTEXT:-_CONTEXT]
         ssd = ((inner - self._pixels) ** 2).sum(axis=(1, 2)) / self.full_scale**2
         feature_yx = found.best_yx + self._anchors + refined.shift_yx
@@ -768,6 +803,7 @@ class _Edge:
 
 _STEEPEST = math.tan(math.radians(15))
 _STRIP_PX = 2.5  # half width of the strip an edge is fitted in: the step and no more
+_LONGEST_ARM_PX = 1e4
 _STRETCH_PX = 4  # of the edge share one pair of grey levels
 
 
@@ -811,6 +847,10 @@ def locate_corner(
     if image.ndim != 2:
         raise InputError(f"an image of {image.ndim} axes came: (rows, columns) was wanted")
     require_positive(reach_px=reach_px, arm_px=arm_px, sigma_limit_px=sigma_limit_px)
+    if max(reach_px, arm_px) > _LONGEST_ARM_PX:
+        raise InputError(
+            f"reach_px is {reach_px:g}, arm_px {arm_px:g}: at most {_LONGEST_ARM_PX:g} was wanted"
+        )
     guess = np.asarray(guess_xy_px, dtype=np.float64)
     if guess.shape != (2,) or not np.isfinite(guess).all():
         raise InputError(f"guess_xy_px is {guess.tolist()}: a finite column and row were wanted")

@@ -32,6 +32,7 @@ from adof_cl.otf import Otf1d, SeparableMaskOtf, stationary_phase_otf
 from adof_cl.otf_table import OtfTable
 from adof_cl.pipeline import Blur, CameraPipeline, WindowedPipeline
 from adof_cl.profile import (
+    REFERENCE,
     REFINES,
     RESTORATIONS,
     SCHEMA,
@@ -70,6 +71,8 @@ ALPHAS_RAD = (3.0, 6.0, 12.0, 20.0, 28.0, 37.5, 50.0, 75.0)
 SHARES = (0.0, 0.3, 0.45, 0.6)
 DEFOCUS_RAD = (0.0, 1.0, 2.0, 3.0, 4.5, 6.0, 9.0)
 """Where the errors of plans are measured: masks and shares of defocus; and defocus without a mask."""
+NOISES = (0.0, 1.0, 2.0, 4.0)
+"""Of the design's: at how much noise."""
 
 _SEARCH_PX = 48  # while other knobs are turned
 _MOVED_UM = 33.0  # parts are moved by up to this between template and frame
@@ -773,7 +776,7 @@ def chain_times(
     Restorations are timed in every window with one search, and searches in one window: their costs add.
     """
     restorations = [r for r in RESTORATIONS if r != "float64" or sweep.device.facts.fp64]
-    base = Chain("float32", 160, "quadratic", TEMPLATE_PX, 32)
+    base = REFERENCE
     chains = [
         (Chain(r, w, base.refine, base.template_px, base.search_px), 1)
         for r, w in product(restorations, WINDOWS)
@@ -830,15 +833,16 @@ def chain_times(
 
 def chain_errors(
     device: Device, seeds: Sequence[int], tell: Tell = lambda _a, _b: None
-) -> tuple[list[ChainError], float]:
-    """Measure every chain's error over masks and defocus, without noise and with the design's.
+) -> tuple[list[ChainError], list[float]]:
+    """Measure every chain's error over masks, defocus and noise.
 
-    Returns the errors and the noise, grey levels.
+    Returns the errors and the noises, grey levels.
     """
-    specimens = [Specimen(device, seed) for seed in seeds]
-    optics, shape = specimens[0].optics, specimens[0].shape
-    rng = np.random.default_rng(1)
-    for specimen in specimens:
+    specimens = {
+        (seed, noise): Specimen(device, seed, noise=noise or 1.0) for seed in seeds for noise in NOISES
+    }
+    optics, shape = specimens[seeds[0], 0.0].optics, specimens[seeds[0], 0.0].shape
+    for specimen in specimens.values():
         for part in PARTS:
             specimen.templates(part, 20)
     pipelines = {
@@ -852,31 +856,36 @@ def chain_errors(
         for r, f in product(("none", "half", "float32"), REFINES)
     }
     errors: list[ChainError] = []
+    count = 0
 
     def measure(
         kinds: Sequence[str], alpha: float, share: float, cases: Sequence[tuple[str, float, Mask]]
     ) -> None:
-        off: dict[tuple[tuple[str, str, int], bool], list[float]] = {}
-        for specimen in specimens:
-            for part, depth, mask in cases:
+        nonlocal count
+        off: dict[tuple[tuple[str, str, int], float], list[float]] = {}
+        for seed, (part, depth, mask) in product(seeds, cases):
+            count += 1
+            for noise in NOISES:
+                specimen = specimens[seed, noise]
+                rng = np.random.default_rng([1, count])  # every noise at the same place
                 place_at_random(specimen, depth, rng)
-                for noise in (False, True):
-                    exposure = specimen.expose(mask, noise=noise)
-                    expected = {part: expected_places(exposure, rng)[part]}
-                    for key, pipeline in pipelines.items():
-                        if key[0] not in kinds:
-                            continue
-                        teach_part(pipeline, specimen, part, key[2])
-                        blur = None if key[0] == "none" else specimen.blur(part, mask)
-                        found = _found(pipeline(exposure.pixels, {part: blur}, expected)[part])
-                        off.setdefault((key, noise), []).append(off_px(found, exposure.corners_px[part]))
+                exposure = specimen.expose(mask, noise=noise > 0)
+                expected = {part: expected_places(exposure, rng)[part]}
+                for key, pipeline in pipelines.items():
+                    if key[0] not in kinds:
+                        continue
+                    teach_part(pipeline, specimen, part, key[2])
+                    blur = None if key[0] == "none" else specimen.blur(part, mask)
+                    found = _found(pipeline(exposure.pixels, {part: blur}, expected)[part])
+                    off.setdefault((key, noise), []).append(off_px(found, exposure.corners_px[part]))
         for key in pipelines:
             if key[0] in kinds:
-                bias, noisy = (max(off[key, noise]) for noise in (False, True))
-                added = math.sqrt(max(noisy**2 - bias**2, 0.0)) if math.isfinite(noisy) else math.inf
-                errors.append(ChainError(*key, alpha, share, bias, added))
+                # Whole pixels may be off by half of one along both axes, whatever a few frames say.
+                least = math.sqrt(0.5) if key[1] == "integer" else 0.0
+                worst = [max(least, *off[key, noise]) for noise in NOISES]
+                errors.append(ChainError(*key, alpha, share, worst))
                 if key[0] == "float32":
-                    errors.append(ChainError("float64", *key[1:], alpha, share, bias, added))
+                    errors.append(ChainError("float64", *key[1:], alpha, share, worst))
 
     for psi in DEFOCUS_RAD:
         tell("errors", f"no mask, defocus {psi:g} rad")
@@ -887,7 +896,8 @@ def chain_errors(
     for alpha, share in product(ALPHAS_RAD, SHARES):
         tell("errors", f"alpha {alpha:g}, psi {3 * alpha * share:.1f} rad")
         measure(("half", "float32"), alpha, share, _cases(optics, alpha, share, per_um))
-    return errors, nominal_noise_grey(specimens[0])
+    nominal = nominal_noise_grey(specimens[seeds[0], 1.0])
+    return errors, [noise * nominal for noise in NOISES]
 
 
 def teach_part(pipeline: WindowedPipeline, specimen: Specimen, part: str, side_px: int) -> None:
@@ -942,7 +952,7 @@ def measure(
         readings += turn_knobs(sweep, stage, rounds, clock, tell)
     tell("chains", "timing in turns")
     times, forms, shared = chain_times(sweep, rounds if quick else Rounds(15, 41, 20.0), clock)
-    errors, noise = chain_errors(device, seeds, tell)
+    errors, noises = chain_errors(device, seeds, tell)
     encoder = SlmEncode(device, sweep.specimens[0].design.panel, sweep.optics)
     mask_s = Spread.of(take_turns([lambda: encoder.codes(sweep.mask)], Rounds(5, 11, 1.0), clock)[0])
     return DeviceProfile(
@@ -964,8 +974,10 @@ def measure(
             "depth_um": sweep.depth_um,
             "noise_grey": scene.noise_grey,
         },
-        noise_grey=noise,
+        noises_grey=noises,
         nsr=NSR,
+        blur_px=sweep.optics.wavelength_um * sweep.optics.f_number / sweep.optics.object_pitch_um,
+        shape=sweep.shape,
         readings=readings,
         times=times,
         forms=forms,
@@ -981,14 +993,15 @@ def measure(
 def pareto(readings: Sequence[Reading]) -> list[Reading]:
     """Return the readings that no other beats in both time and error, quickest first.
 
-    Times of whole chains and of a knob's own part are not compared with each other.
+    Errors within a tenth of each other count as one: a dozen specimens do not tell them apart. Times of whole
+    chains and of a knob's own part are not compared with each other.
     """
     fronts: list[Reading] = []
     for whole in (False, True):
         least = math.inf
         mine = [r for r in readings if r.whole_chain == whole]
         for reading in sorted(mine, key=lambda r: (r.time_s.median, r.worst_um)):
-            if reading.worst_um < least:
+            if reading.worst_um < least / _ALIKE:
                 least = reading.worst_um
                 fronts.append(reading)
     return fronts

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from adof_cl.device import Device, DeviceArray
 from adof_cl.errors import InputError
-from adof_cl.finite import TRANSFER_LIMIT, require_transfer
+from adof_cl.finite import TRANSFER_LIMIT, checked_shape, require_transfer
 from adof_cl.noise import checked_nsr
 from adof_cl.program import Program
 
@@ -42,10 +42,8 @@ class WienerFilter:
     """
 
     def __init__(self, device: Device, shape: tuple[int, int], *, precision: str = "float32") -> None:
-        if len(shape) != 2 or min(shape) < 2:
-            raise InputError(f"the padded shape is {tuple(shape)}: two sides of 2 or more were wanted")
         self.device = device
-        self.shape = ny, nx = int(shape[0]), int(shape[1])
+        self.shape = ny, nx = checked_shape("the padded shape", shape, 2)
         self.filter_shape = half = (ny, nx // 2 + 1)
         self._real = device.real_type(precision)
         self._complex = np.dtype(np.result_type(self._real, np.complex64))
@@ -90,7 +88,7 @@ class WienerFilter:
         axes = []
         for name, values, length in (("h_rows", h_rows, self.shape[0]), ("h_cols", h_cols, self.shape[1])):
             axis = np.asarray(values)
-            if axis.shape != (length,) or not np.isfinite(axis).all():
+            if axis.shape != (length,) or axis.dtype.kind not in "fciu" or not np.isfinite(axis).all():
                 raise InputError(
                     f"{name} is {axis.shape} {axis.dtype}: ({length},) finite numbers were wanted"
                 )
@@ -115,7 +113,8 @@ class WienerFilter:
             Wrong shape, not finite, or negative nsr.
         """
         spectrum = np.asarray(otf)
-        if spectrum.shape != self.filter_shape or not np.isfinite(spectrum).all():
+        numbers = spectrum.dtype.kind in "fciu"
+        if spectrum.shape != self.filter_shape or not numbers or not np.isfinite(spectrum).all():
             raise InputError(
                 f"otf is {spectrum.shape} {spectrum.dtype}: {self.filter_shape} finite numbers were wanted"
             )
@@ -192,6 +191,7 @@ def psf_otf(
     ------
     docs/maths.md, eq. W6.
     """
+    shape = checked_shape("the padded shape", shape)
     values = np.asarray(psf)
     if values.ndim != 2 or values.size == 0 or values.dtype.kind not in "fiu":
         raise InputError(f"the PSF is {values.shape} {values.dtype}: a real (rows, columns) was wanted")
@@ -213,8 +213,9 @@ def psf_otf(
             f"the PSF's negative values leave {total / moduli:.1g} of its sum: at least "
             f"{1 / TRANSFER_LIMIT:g} was wanted, so subtract the dark frame anew"
         )
-    centre = centre_yx or (values.shape[0] // 2, values.shape[1] // 2)
-    if any(not 0 <= c < side for c, side in zip(centre, values.shape, strict=True)):
+    middle = (values.shape[0] // 2, values.shape[1] // 2)
+    centre = middle if centre_yx is None else checked_shape("centre_yx", centre_yx, 0)
+    if any(c >= side for c, side in zip(centre, values.shape, strict=True)):
         raise InputError(f"the PSF's centre is {centre}: a pixel of its {values.shape} was wanted")
     padded = np.zeros(shape)
     padded[: values.shape[0], : values.shape[1]] = grid / total

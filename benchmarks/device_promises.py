@@ -4,26 +4,35 @@ python benchmarks/device_promises.py [--rounds 5]
 
 Cameras are emulated GigE Vision cameras at 60 fps, in this process, taken through viva-genicam over loopback
 and asked with a time-out of three periods, as a control loop would. The window needs a display of
-1920 x 1080, such as xvfb-run gives. Prints the numbers of docs/device-promises.md.
+1920 x 1080, such as xvfb-run gives, the operator's devices umockdev. Prints the numbers of
+docs/device-promises.md.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import os
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from adof_drivers.camera import WatchedCamera
 from adof_drivers.camera_pair import CameraPair
 from adof_drivers.emulators.gige import Faults, GigeCameraEmulator, Region
-from adof_drivers.emulators.hid import EmulatedHid, EmulatedSpaceMouse
+from adof_drivers.emulators.hid_nodes import command
 from adof_drivers.errors import DeviceLostError, DriverError, FrameTimeoutError, FrozenFramesError
 from adof_drivers.gige import GigeCamera
+from adof_drivers.hid_device import choose_hid
 from adof_drivers.pedal import StopPedal
+from adof_drivers.relay import IDENTITIES, HidRelay
 from adof_drivers.slm_window import SlmWindow
 from adof_drivers.spacemouse import SpaceMouse
 
@@ -112,27 +121,119 @@ def worst_gap(faults: Faults, late_s: float) -> tuple[float, WatchedCamera]:
         return float(np.diff(times_s).max()), watched
 
 
-def spacemouse() -> float:
-    device = EmulatedSpaceMouse(joined=True)
-    mouse = SpaceMouse(device)
-    device.deflect(0, 0, 0)
-    mouse.poll()
-    device.deflect(350, 0, 0)
-    assert any(mouse.poll().axes)
-    device.unplug()
+def refused(ask: Callable[[], object]) -> float:
     begun_s = time.monotonic()
-    assert not any(mouse.poll().axes)
-    return time.monotonic() - begun_s
+    try:
+        ask()
+    except DriverError:
+        return time.monotonic() - begun_s
+    raise SystemExit("it was not refused")
 
 
-def pedal() -> float:
-    device = EmulatedHid()
-    held = StopPedal(device)
-    assert not held.poll().stop
-    device.unplug()
-    begun_s = time.monotonic()
-    assert held.poll().stop
-    return time.monotonic() - begun_s
+def second_program() -> float:
+    with camera():
+        return refused(lambda: GigeCamera("127.0.0.1"))
+
+
+def power_cycle() -> float:
+    """From the camera being there again to its first frame."""
+    with camera():
+        pass
+    with GigeCameraEmulator(picture, SENSOR):
+        begun_s = time.monotonic()
+        opened = GigeCamera("127.0.0.1")
+        opened.start()
+        opened.grab()
+        took_s = time.monotonic() - begun_s
+        opened.close()
+        return took_s
+
+
+def again(open_: Callable[[], Any]) -> Any:
+    """Open a device as soon as it is there."""
+    ends_s = time.monotonic() + 10
+    while True:
+        try:
+            return open_()
+        except DriverError:
+            if time.monotonic() > ends_s:
+                raise
+
+
+def when(wanted: Callable[[], bool]) -> float:
+    ends_s = time.monotonic() + 10
+    while not wanted():
+        if time.monotonic() > ends_s:
+            raise SystemExit("it never came")
+    return time.monotonic()
+
+
+def among_devices(rounds: int, commands: str) -> None:
+    """What the operator's devices promise; runs as a program among them, and says what happens to them."""
+    pipe = Path(commands).open("w", buffering=1, encoding="ascii")  # noqa: SIM115  (until the end)
+    times_ms: dict[str, list[float]] = {}
+
+    def do(line: str) -> float:
+        pipe.write(f"{line}\n")
+        return time.monotonic()
+
+    def note(name: str, took_s: float) -> None:
+        times_ms.setdefault(name, []).append(1e3 * took_s)
+
+    for _ in range(rounds):
+        mouse, pedal, relay = (again(device.open) for device in (SpaceMouse, StopPedal, HidRelay))
+        do("spacemouse deflect 0 0 0")
+        do("wait 0.1")
+        do("spacemouse deflect 350 0 0")
+        when(lambda: any(mouse.poll().axes))  # noqa: B023
+        begun_s = do("spacemouse silence")
+        note("SpaceMouse silent while deflected", when(lambda: not any(mouse.poll().axes)) - begun_s)  # noqa: B023
+        do("spacemouse deflect 350 0 0")
+        when(lambda: any(mouse.poll().axes))  # noqa: B023
+        begun_s = do("spacemouse unplug")
+        note("SpaceMouse unplugged while deflected", when(lambda: not any(mouse.poll().axes)) - begun_s)  # noqa: B023
+        mouse.close()
+        begun_s = do("spacemouse plug")
+        mouse = again(SpaceMouse.open)
+        note("SpaceMouse plugged in again, opened", time.monotonic() - begun_s)
+        begun_s = do("pedal press")
+        note("pedal pressed", when(lambda: pedal.poll().stop) - begun_s)  # noqa: B023
+        do("pedal release")
+        when(lambda: not pedal.poll().stop)  # noqa: B023
+        begun_s = do("pedal unplug")
+        note("pedal unplugged", when(lambda: pedal.poll().stop) - begun_s)  # noqa: B023
+        begun_s = time.monotonic()
+        relay.switch(0, on=True)
+        note("relay switched and read back", time.monotonic() - begun_s)
+        held, _ = choose_hid("USB relay", IDENTITIES)
+        note("device held by a program, refused", refused(HidRelay.open))
+        note("another device at a path, refused", refused(lambda: SpaceMouse.open(held.decode())))  # noqa: B023
+        begun_s = do("relay unplug")
+        note("relay unplugged", until(DeviceLostError, relay.state) - begun_s)
+        for device in (mouse, pedal, relay):
+            device.close()
+        do("pedal plug")
+        do("relay plug")
+    for name, values_ms in times_ms.items():
+        tell(name, values_ms)
+
+
+def operator(rounds: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        commands = Path(folder) / "commands"
+        os.mkfifo(commands)
+        program = [sys.executable, __file__, "--rounds", str(rounds), "--among-devices", str(commands)]
+        with open(os.open(commands, os.O_RDWR)) as pipe:  # noqa: PTH123
+            subprocess.run(
+                command(["spacemouse", "pedal", "relay"], program, script="-"),
+                stdin=pipe,
+                stderr=subprocess.DEVNULL,
+                check=True,
+            )
+
+
+def tell(name: str, times_ms: list[float]) -> None:
+    print(f"{name:42} median {np.median(times_ms):8.3f} ms, worst {max(times_ms):8.3f} ms", flush=True)
 
 
 def window() -> float:
@@ -145,24 +246,31 @@ def window() -> float:
     return until(DeviceLostError, lambda: slm.show(np.zeros((1080, 1920), np.uint8))) - begun_s
 
 
+def second_window() -> float:
+    with SlmWindow((1080, 1920), monitor=0):
+        return refused(lambda: SlmWindow((1080, 1920), monitor=0))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--rounds", type=int, default=5)
-    rounds = parser.parse_args().rounds
+    parser.add_argument("--among-devices", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    rounds = given.rounds
+    if given.among_devices:
+        among_devices(rounds, given.among_devices)
+        return
 
     def worst(name: str, measure: Callable[[], float]) -> None:
-        times_ms = [1e3 * measure() for _ in range(rounds)]
-        print(f"{name:42} median {np.median(times_ms):8.3f} ms, worst {max(times_ms):8.3f} ms", flush=True)
+        tell(name, [1e3 * measure() for _ in range(rounds)])
 
     lost = [unplugged() for _ in range(rounds)]
-    for name, times_s in zip(
-        ("unplugged: no frame", "unplugged: gone"), zip(*lost, strict=True), strict=True
-    ):
-        print(
-            f"camera {name:35} median {1e3 * np.median(times_s):8.3f} ms, worst {1e3 * max(times_s):8.3f} ms"
-        )
+    for name, times_s in zip(("no frame", "gone"), zip(*lost, strict=True), strict=True):
+        tell(f"camera unplugged: {name}", [1e3 * time_s for time_s in times_s])
+    worst("camera back after a power cycle, opened", power_cycle)
+    worst("camera held by a program, refused", second_program)
     worst("one of two cameras lost: no pair", one_of_two)
     worst("camera frozen, from the first repeat", frozen)
     for name, faults, late_s in (
@@ -173,9 +281,9 @@ def main() -> None:
     ):
         gap_s, watched = worst_gap(faults, late_s)
         print(f"{name:42} longest wait {1e3 * gap_s:6.1f} ms; {watched.counts}", flush=True)
-    worst("SpaceMouse unplugged while deflected", spacemouse)
-    worst("pedal unplugged", pedal)
+    operator(rounds)
     worst("SLM window closed", window)
+    worst("SLM's monitor held by a program, refused", second_window)
 
 
 if __name__ == "__main__":

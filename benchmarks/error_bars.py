@@ -6,8 +6,8 @@
 A draw is a pair of frames: parts somewhere else, at other depths, through another mask, with new noise, and
 with templates taken anew, as the loop takes them, at another place and depth. Counted is how often the truth
 lies in the 95 % ellipse of a feature, and within 1.96 sigma of a depth whose cameras were calibrated anew,
-with noise; beside it the scatter that so many draws leave, and the median of the squared distances in units of
-the bar: 1.39 for a feature, 0.45 for a depth, where the bars are right on average.
+with noise; beside it the scatter that so many draws leave, and the median of the squared distances in units
+of the bar: 1.39 for a feature, 0.45 for a depth, where the bars are right on average.
 """
 
 from __future__ import annotations

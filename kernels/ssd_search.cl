@@ -54,6 +54,7 @@
 #endif
 
 #define TAPS (TEMPLATE_ROWS * TEMPLATE_COLUMNS)
+#define LEAST_VARIANCE 1e-30f // times TAPS: below it squares lose digits, and a footprint counts as flat
 #define SCORE_NONE 0x7fffffff
 #if PATCH_MARGIN < 0
 #define PATCH_ROWS 0
@@ -98,7 +99,7 @@ ALWAYS_INLINE vec gain_offset_score(const vec covariance, const vec image_varian
 {
     const vec residual = 1.0f - (covariance / image_variance) * (covariance / template_variance);
     const vec score = residual > 0.0f ? residual : (vec)0.0f;
-    return ((covariance > 0.0f) & (image_variance > 0.0f)) ? score : (vec)1.0f;
+    return ((covariance > 0.0f) & (image_variance > LEAST_VARIANCE)) ? score : (vec)1.0f;
 }
 #endif
 

@@ -12,6 +12,7 @@ import hypothesis
 import pytest
 
 from adof_cl.device import Device
+from loopback import control_packets_elsewhere
 
 hypothesis.settings.register_profile(
     "seeded", derandomize=True, deadline=None, max_examples=25, print_blob=True
@@ -51,10 +52,12 @@ def precision(request: pytest.FixtureRequest, device: Device) -> str:
 
 @pytest.fixture
 def loopback_cameras() -> Iterator[None]:
-    """Let one test at a time have the cameras' address and port, whichever process it runs in."""
+    """Let one test at a time have the cameras' address and port, and see that it asks nobody elsewhere."""
     with (Path(tempfile.gettempdir()) / "adof-loopback-cameras.lock").open("w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        yield
+        with control_packets_elsewhere() as seen:
+            yield
+        assert not seen, f"GigE Vision control packets left the machine: {seen}"
 
 
 @pytest.fixture(scope="session")

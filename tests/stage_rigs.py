@@ -10,9 +10,16 @@ from threading import Lock
 from adof_drivers.emulators.faults import Fault, FaultSchedule
 from adof_drivers.emulators.gcs import GcsEngine
 from adof_drivers.emulators.serve import Served
-from adof_drivers.emulators.usb_bus import UsbBus
+from adof_drivers.emulators.usb_bus import FtdiBus, UsbBus
 from adof_drivers.gcs import GcsController
-from adof_drivers.link import Link, SerialTransport, TcpTransport, Transport, UsbTransport
+from adof_drivers.link import (
+    FtdiTransport,
+    Link,
+    SerialTransport,
+    TcpTransport,
+    Transport,
+    UsbTransport,
+)
 from adof_drivers.safety import StageAxis
 from adof_drivers.stage import Stage
 
@@ -23,11 +30,12 @@ AXES = {
 
 
 class ManualClock:
-    """Time that passes only when someone waits for it."""
+    """Time that passes only when someone waits for it; what repeats is called as it passes."""
 
     def __init__(self) -> None:
         self._lock = Lock()
         self._now_s = 100.0
+        self._repeated: list[tuple[float, float, Callable[[], bool]]] = []
 
     @property
     def now_s(self) -> float:
@@ -35,7 +43,23 @@ class ManualClock:
 
     def wait(self, duration_s: float) -> None:
         with self._lock:
+            end_s = self._now_s + duration_s
+        while self._repeated and min(self._repeated)[0] <= end_s:
+            due_s, period_s, action = self._repeated.pop(self._repeated.index(min(self._repeated)))
+            with self._lock:
+                self._now_s = max(self._now_s, due_s)
+            if action():
+                self.repeat(action, period_s)
+        with self._lock:
+            self._now_s = max(self._now_s, end_s)
+
+    def hang(self, duration_s: float) -> None:
+        """Let time pass in which the program does nothing."""
+        with self._lock:
             self._now_s += duration_s
+
+    def repeat(self, action: Callable[[], bool], period_s: float) -> None:
+        self._repeated.append((self._now_s + period_s, period_s, action))
 
 
 @contextmanager
@@ -44,6 +68,10 @@ def wired(engine: GcsEngine, wire: str) -> Iterator[Callable[[], Transport]]:
     if wire == "usb":
         bus = UsbBus(engine, 0x1A72, 0x1003)
         yield lambda: UsbTransport(0x1A72, backend=bus)
+        return
+    if wire == "ftdi":
+        bridge = FtdiBus(engine, 0x1A72, 0x1007)
+        yield lambda: FtdiTransport(0x1A72, 0x1007, backend=bridge)
         return
     with Served.tcp(engine) if wire == "tcp" else Served.pty(engine) as served:
         yield (
@@ -68,12 +96,13 @@ def gcs_rig(*faults: Fault, wire: str = "tcp", timeout_s: float = 1.0, ready: bo
     engine = GcsEngine(("1", "2"), now_s=lambda: clock.now_s)
     with ExitStack() as stack:
         connect = stack.enter_context(wired(engine, wire))
-        link = Link(connect(), timeout_s=timeout_s)
+        link = Link(connect())
         stage = stack.enter_context(Stage(GcsController(link), AXES, clock=clock))
         if ready:
             arm(stage)
             stage.enable()
             stage.home(confirm=True)
+        link.timeout_s = timeout_s
         engine.received.clear()
         engine.faults = FaultSchedule(faults)
         yield Rig(clock, engine, link, stage)

@@ -143,8 +143,8 @@ def test_what_cannot_be_swept_is_refused() -> None:
     for low, high, options, words in (
         (1, 1, {}, "is empty"),
         (0, math.inf, {}, "finite"),
-        (0, 1, {"coarse": 4}, "at least 5"),
-        (0, 1, {"rounds": 0}, "at least 5 and 1"),
+        (0, 1, {"coarse": 4}, "coarse is 4: a whole number of 5"),
+        (0, 1, {"rounds": 0}, "rounds is 0: a whole number of 1"),
     ):
         with pytest.raises(InputError, match=words):
             focus_sweep(lambda _: 1.0, low, high, **options)

@@ -106,7 +106,7 @@ def test_what_cannot_be_is_refused_in_one_sentence_before_anything_is_timed(
 def test_a_file_that_is_not_ours_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "r.json").write_text('{"schema_version": 1}')
     assert run("--quick", "--compare", tmp_path / "r.json") == 2
-    assert "is not a results file of adof bench" in capsys.readouterr().err
+    assert "is not a results file: give one that adof bench" in capsys.readouterr().err
 
 
 def test_a_place_that_cannot_be_written_is_refused_before_anything_is_timed(

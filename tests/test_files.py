@@ -1,13 +1,18 @@
 from __future__ import annotations
 
+import json
 import os
 import stat
+import tempfile
 from pathlib import Path
 
+import pydantic
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from adof_cl.errors import InputError
-from adof_cl.files import whole_file
+from adof_cl.files import read_versioned, whole_file
 
 
 def written(path: Path, text: str) -> None:
@@ -85,3 +90,45 @@ def test_a_folder_in_the_files_place_is_refused_and_stays(tmp_path: Path) -> Non
         written(path, "text")
     assert os.listdir(tmp_path) == ["a.txt"]  # noqa: PTH208  (hidden leftovers count as well)
     assert path.is_dir()
+
+
+class Kept(pydantic.BaseModel):
+    schema_version: int
+    values: list[float]
+
+
+KEPT = pydantic.TypeAdapter(Kept)
+
+
+@given(st.lists(st.floats(allow_nan=False)))
+def test_what_is_written_is_read_infinities_too(values: list[float]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "kept.json"
+        path.write_text(json.dumps({"schema_version": 3, "values": values}))
+        assert read_versioned(path, KEPT, 3, "a list", "adof list").values == values
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "is not a list: give one that adof list wrote"),
+        ("\xff", "is not a list"),
+        ("[]", "is not a list"),
+        ("{}", "is not a list"),
+        ('{"schema_version": 3}', "is not a list"),
+        ('{"schema_version": "3", "values": "x"}', "is not a list"),
+        ('{"schema_version": 2}', "has schema version 2, 3 was wanted: adof list writes it anew"),
+    ],
+)
+def test_what_is_something_else_or_of_another_version_is_refused(
+    tmp_path: Path, text: str, sentence: str
+) -> None:
+    path = tmp_path / "kept.json"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=sentence):
+        read_versioned(path, KEPT, 3, "a list", "adof list")
+
+
+def test_a_file_that_is_not_there_says_who_writes_it(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"cannot be read .*: adof list writes a list"):
+        read_versioned(tmp_path / "none.json", KEPT, 3, "a list", "adof list")

@@ -3,44 +3,22 @@
 from __future__ import annotations
 
 import re
+import time
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adof_drivers.emulators.gcs import GcsEngine
+from adof_drivers.emulators.serve import Served
 from adof_drivers.errors import DialectError, DriverError, LinkError, StoppedError
 from adof_drivers.gcs import GcsController
 from adof_drivers.link import Link
+from memory_transport import MemoryTransport
 from stage_rigs import ManualClock
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _POSITIONS = re.compile(rf"\s*1=({_NUMBER})\s*\n\s*2=({_NUMBER})\s*\n")
-
-
-class MemoryTransport:
-    """An engine with no wire between; `instead` answers the next line in its place."""
-
-    name = "memory"
-
-    def __init__(self, engine: GcsEngine) -> None:
-        self.engine = engine
-        self._replies = b""
-        self.instead: bytes | None = None
-        self.closed = False
-
-    def write(self, data: bytes) -> None:
-        replies = b"".join(reply.data for reply in self.engine.feed(data))
-        self._replies += replies if self.instead is None else self.instead
-        self.instead = None
-
-    def read_some(self, timeout_s: float) -> bytes:
-        assert timeout_s >= 0
-        piece, self._replies = self._replies[:31], self._replies[31:]
-        return piece
-
-    def close(self) -> None:
-        self.closed = True
 
 
 def opened(**engine: str) -> tuple[GcsController, MemoryTransport]:
@@ -159,3 +137,29 @@ def test_a_stop_that_comes_while_a_move_is_sent_has_the_last_word() -> None:
     sent = [line[:3] for line in transport.engine.received[-5:]]
     assert sent == [b"\x18", b"VEL", b"MOV", b"ERR", b"\x18"]
     assert transport.engine.motors["1"].target != 20.0
+
+
+@pytest.mark.filterwarnings("ignore")  # another project's
+def test_pylablibs_own_client_drives_the_emulator_unmodified() -> None:
+    pi = pytest.importorskip(
+        "pylablib.devices.PhysikInstrumente", reason="pylablib (GPL) is an oracle, not a need"
+    )
+    engine = GcsEngine(("A",), now_s=time.monotonic)
+    # Its E-516 is a piezo amplifier that speaks GCS: online mode is its own, referencing is not.
+    with Served.pty(engine) as on, pi.PIE516(("serial", on.address), auto_online=False) as theirs:
+        assert "Emulated" in theirs.get_id()
+        assert any(line.startswith("MOV ") for line in theirs.get_help())
+        assert theirs.enable_servo()
+        theirs.query("FRF", reply=False)
+        assert theirs.set_velocity(4.0) == 4.0
+        assert theirs.move_to(13.0) == 13.0
+        while engine.moving:
+            time.sleep(0.001)
+        assert theirs.get_position() == 13.0
+        assert theirs.move_by(5.0) == 18.0
+        theirs.stop()
+        assert theirs.get_target_position() < 18.0
+        while engine.moving:
+            time.sleep(0.001)
+        assert theirs.get_position() == pytest.approx(engine.position["A"], abs=1e-6)
+        assert 13.0 <= engine.position["A"] < 18.0

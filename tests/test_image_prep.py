@@ -91,7 +91,7 @@ def test_what_cannot_be_prepared_is_refused(device: Device, region_plan: ImagePr
     for words, options in refused:
         with pytest.raises(InputError, match=words):
             ImagePrep(device, (17, 23), **options)
-    with pytest.raises(InputError, match="each at least 1"):
+    with pytest.raises(InputError, match="whole numbers of 1 or more"):
         ImagePrep(device, (0, 23))
     with pytest.raises(InputError, match="frame of shape"):
         region_plan.prepare(np.zeros((17, 23), np.uint16))

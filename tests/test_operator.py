@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import pytest
 from hypothesis import given
@@ -94,6 +95,20 @@ def test_plugged_in_while_deflected_is_rest_until_the_puck_was_let_go() -> None:
     assert mouse.poll().axes[0] == 1
 
 
+@pytest.mark.parametrize("joined", [False, True])
+@given(st.lists(st.tuples(st.integers(0, 5), st.floats(0, 1)), min_size=1, max_size=12))
+def test_no_silence_and_no_half_at_rest_arms_a_puck_that_was_heard_deflected(
+    joined: bool, pushes: list[tuple[int, float]]
+) -> None:
+    device, clock = EmulatedSpaceMouse(joined=joined), Clock()
+    mouse = SpaceMouse(device, clock=clock)
+    for axis_, silent_s in pushes:
+        device.deflect(*(350 if n == axis_ else 0 for n in range(6)))
+        assert mouse.poll().axes == REST
+        clock.now_s += silent_s
+        assert mouse.poll().axes == REST
+
+
 def test_an_untouched_puck_says_nothing_and_may_jog_at_its_first_push() -> None:
     device, clock = EmulatedSpaceMouse(joined=True), Clock()
     mouse = SpaceMouse(device, clock=clock)
@@ -176,6 +191,24 @@ def test_a_pedal_unplugged_closed_or_not_understood_means_stop(kind: str) -> Non
         assert [pedal.poll().stop for _ in range(2)] == [True, True]
 
 
+@pytest.mark.parametrize("kind", FORMS)
+@given(st.lists(st.binary(min_size=1, max_size=64), min_size=1, max_size=6))
+def test_a_pedal_is_free_only_after_a_report_that_says_so(kind: str, came: list[bytes]) -> None:
+    form, closed, down, up = FORMS[kind]
+    device = EmulatedHid()
+    pedal = StopPedal(device, form=form, normally_closed=closed)  # type: ignore[arg-type]
+    for report in came:
+        device.send(report)
+        pedal.poll()
+        last = report[1:] if form == "keyboard" and len(report) == 9 else report
+        known = len(last) == 8 if form == "keyboard" else len(last) <= 8
+        released = not any(last) if form == "keyboard" else (last[0] == 0) != closed
+        assert pedal.poll().stop is not (known and released)
+    device.send(up)
+    device.send(down)
+    assert pedal.poll().stop
+
+
 def test_a_pedal_of_unknown_form_is_refused() -> None:
     for wrong in ({"form": "mouse"}, {"form": "keyboard", "normally_closed": True}):
         with pytest.raises(DriverError):
@@ -213,6 +246,29 @@ def test_a_relay_that_sticks_is_told_and_one_that_is_not_there_refused() -> None
     relay.close()
     with pytest.raises(DriverError, match="1 to 8"):
         HidRelay(device, 9)
+
+
+@given(st.binary(max_size=64), st.integers(0, 7), st.booleans())
+def test_whatever_a_relay_board_answers_is_its_state_or_a_clear_error(
+    reply: bytes, channel: int, on: bool
+) -> None:
+    class Garbled(EmulatedRelay):
+        def get_feature_report(self, report_num: int, max_length: int) -> Sequence[int]:  # noqa: ARG002
+            return list(reply)
+
+    relay = HidRelay(Garbled(), 8)
+    if len(reply) not in (8, 9):
+        for ask in (relay.state, lambda: relay.switch(channel, on=on)):
+            with pytest.raises(DriverError, match=f"answered {len(reply)} bytes"):
+                ask()
+        return
+    told = relay.state()
+    assert list(told) == [bool(reply[-1] >> n & 1) for n in range(8)]
+    if told[channel] is on:
+        relay.switch(channel, on=on)
+    else:
+        with pytest.raises(DriverError, match="did not switch"):
+            relay.switch(channel, on=on)
 
 
 def test_a_device_that_is_not_connected_is_named_by_its_identity() -> None:

@@ -62,6 +62,21 @@ def test_a_velocity_expires_and_a_stop_ends_it_sooner() -> None:
         assert stage.position()["x"] == pytest.approx(18.0, abs=0.3)
 
 
+def test_velocities_are_renewed_at_rest_and_zero_halts_at_once() -> None:
+    with rig() as (stage, engine, clock):
+        for _ in range(5):
+            stage.set_velocity({"x": 30.0}, expires_s=0.1)  # sent in motion it would be refused
+            clock.wait(0.05)
+        assert engine.moving
+        before_s = clock.now_s
+        stage.set_velocity({"x": 0.0})
+        assert clock.now_s == before_s
+        at = stage.position()["x"]
+        clock.wait(1.0)
+        # 1000 steps/s are braked on 5 steps.
+        assert stage.position()["x"] - at <= 6 * STEP_UM
+
+
 def test_homing_moves_nothing_and_is_wanted_again_after_a_new_connection() -> None:
     with rig() as (stage, engine, _clock):
         assert engine.position["1"] == 0.0

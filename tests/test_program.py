@@ -56,6 +56,18 @@ def test_defines_and_headers_reach_the_kernel(device: Device) -> None:
     assert run(device, 5) == [-5, 20]
 
 
+def test_a_devices_own_build_options_reach_every_program_and_its_cache_entry(
+    device: Device, kernels: Path
+) -> None:
+    needs_cache(device)
+    assert run(device) == [-3, 12]
+    own = Device(device.facts, device.handle)
+    own.build_options = ("-cl-denorms-are-zero",)
+    assert run(own) == [-3, 12]
+    assert len(entries(kernels)) == 2
+    assert "-cl-denorms-are-zero" in Program(own, "square.cl", {"SCALE": 3}).options
+
+
 def test_a_second_build_comes_from_the_cache_and_gives_the_same(device: Device, kernels: Path) -> None:
     needs_cache(device)
     first = run(device)

@@ -105,9 +105,9 @@ def test_terms_and_strengths_that_are_no_numbers_are_refused(device: Device) -> 
         plan.set_odd(y_rad=np.full(4, np.nan))
     with pytest.raises(InputError, match="map_rad has shape"):
         plan.set_map(np.zeros((5, 4)))
-    with pytest.raises(InputError, match="tilt_x_rad is inf"):
+    with pytest.raises(InputError, match="tilt_xy_rad is"):
         plan(Mask(), tilt_xy_rad=(np.inf, 0.0))
     with pytest.raises(LimitError, match="alpha is 200000"):
         plan(Mask(2e5))
-    with pytest.raises(InputError, match="pupil samples"):
+    with pytest.raises(InputError, match="rows is 0"):
         PupilPhase(device, 0, 5)

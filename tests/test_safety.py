@@ -6,9 +6,10 @@ import itertools
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from adof_drivers.emulators.motion import Motor
 from adof_drivers.errors import FollowingError, LimitError, NotArmedError, RequestError
 from adof_drivers.safety import Course, EnableLatch, Limits, MotionWatch, StageAxis
 
@@ -110,3 +111,45 @@ def test_after_a_stop_no_place_is_held_against_an_axis() -> None:
     watch.begin({"x": Course(0.0, 0.0, 100.0, 10.0)})
     watch.forget()
     watch.check(100.0, {"x": -3.0})
+
+
+@given(
+    commands=st.lists(
+        st.tuples(st.floats(0.01, 0.4), st.floats(0, 25_000), st.floats(50, 5000), st.sampled_from("mmmmhs")),
+        min_size=2,
+        max_size=8,
+    )
+)
+@settings(max_examples=100, deadline=None)
+def test_an_axis_that_brakes_turns_and_is_sent_elsewhere_on_its_way_is_believed(
+    commands: list[tuple[float, float, float, str]],
+) -> None:
+    motor = Motor(-1e4, 35e3, speed=5000.0, acceleration=50_000.0, position=12_500.0)
+    # To brake from full speed and to gain it takes 0.1 s each; the emulated motor's step is 1 ms.
+    watch = MotionWatch({"x": axis(following=5.0, lag_s=0.2 + 0.01)})
+    now_s = 0.0
+    for lasts_s, target, speed, what in commands:
+        if what == "m":
+            motor.speed = speed
+            motor.go(target)
+            watch.begin({"x": Course(now_s, motor.position, target, speed)})
+        else:
+            motor.halt()
+            watch.forget() if what == "s" else watch.leave(["x"])
+        ends_s = now_s + lasts_s
+        while now_s < ends_s:
+            now_s += 0.01
+            motor.advance(now_s)
+            watch.check(now_s, {"x": motor.position})
+
+
+@given(speed=st.floats(100, 5000), slower=st.floats(100, 5000), sign=st.sampled_from([-1, 1]))
+def test_an_axis_that_sticks_as_it_is_sent_elsewhere_is_found(speed: float, slower: float, sign: int) -> None:
+    watch = MotionWatch({"x": axis(following=5.0, lag_s=0.2)})
+    watch.begin({"x": Course(0.0, 0.0, 1e6, speed)})
+    watch.check(1.0, {"x": speed})
+    watch.begin({"x": Course(1.0, speed, speed + sign * 1e6, slower)})
+    # It might have run on for the lag, and come all the way back.
+    found_s = 1.0 + 2 * (0.2 * (1 + speed / slower) + 10.1 / slower + 0.2)
+    with pytest.raises(FollowingError):
+        watch.check(found_s, {"x": speed})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -154,6 +155,19 @@ def test_a_closed_window_is_lost_and_can_be_opened_again() -> None:
 
 
 @needs_gl
+def test_a_second_program_is_refused_and_the_first_goes_on(display: str) -> None:
+    opens = f"from adof_drivers.slm_window import SlmWindow; SlmWindow({SHAPE}, monitor=0)"
+    with SlmWindow(SHAPE, monitor=0) as slm:
+        slm.show(codes(1))
+        other = subprocess.run([sys.executable, "-c", opens], capture_output=True, text=True)
+        assert "another program shows its patterns on screen: close that one" in other.stderr
+        np.testing.assert_array_equal(screen(display)[..., 0], codes(1))
+        assert slm.show(codes(2)).number == 2
+        np.testing.assert_array_equal(screen(display)[..., 0], codes(2))
+    assert subprocess.run([sys.executable, "-c", opens]).returncode == 0
+
+
+@needs_gl
 @pytest.mark.usefixtures("display")
 def test_another_thread_is_refused() -> None:
     with SlmWindow(SHAPE, monitor=0) as slm:
@@ -232,3 +246,14 @@ def test_the_chosen_monitor_shows_the_codes_and_the_other_is_left_alone(
             after[:480, 800:1440], codes(5, (480, 640))[..., None].repeat(3, axis=2)
         )
         np.testing.assert_array_equal(after[:, :800], before[:, :800])
+        with SlmWindow((480, 640), monitor="DUMMY1") as slm:
+            subprocess.run(["xrandr", "--output", "DUMMY1", "--off"], check=True)
+            for said in ("monitor is gone", "is closed"):
+                with pytest.raises(DeviceLostError, match=said):
+                    slm.show(codes(6, (480, 640)))
+        with pytest.raises(DriverError, match="is none of: 0 DUMMY0"):
+            SlmWindow((480, 640), monitor="DUMMY1")
+        subprocess.run(["xrandr", *["--output", "DUMMY1", "--mode", "640x480", "--right-of", "DUMMY0"]])
+        with SlmWindow((480, 640), monitor="DUMMY1") as slm:
+            slm.show(codes(7, (480, 640)))
+            np.testing.assert_array_equal(screen(display)[:480, 800:1440, 0], codes(7, (480, 640)))

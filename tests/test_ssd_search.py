@@ -326,14 +326,14 @@ def test_a_window_that_leaves_the_image_is_refused_or_moved_inside_by_the_smalle
 
 def test_what_cannot_be_searched_is_refused(device: Device, small_plan: SsdSearch) -> None:
     refused: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = [
-        ("at least 1 template", ((9, 9), (2, 2), (5, 5), 0), {}),
+        ("count is 0", ((9, 9), (2, 2), (5, 5), 0), {}),
         ("choose uint8, uint16 or float32", ((9, 9), (2, 2), (5, 5), 1), {"dtype": np.float64}),
         ("choose 'ssd' or 'gain_offset'", ((9, 9), (2, 2), (5, 5), 1), {"score": "zncc"}),
         ("choose 'lanes' or 'groups'", ((9, 9), (2, 2), (5, 5), 1), {"family": "cpu"}),
         ("at most 64 pixels a side", ((90, 90), (65, 2), (80, 5), 1), {}),
         ("do not nest", ((9, 9), (6, 2), (5, 5), 1), {}),
         ("do not nest", ((9, 9), (2, 2), (10, 5), 1), {}),
-        ("each at least 1", ((9, 9), (0, 2), (5, 5), 1), {}),
+        ("whole numbers of 1 or more", ((9, 9), (0, 2), (5, 5), 1), {}),
         ("patch_margin is -1", ((9, 9), (2, 2), (5, 5), 1), {"patch_margin": -1}),
         ("one pixel has no contrast", ((9, 9), (1, 1), (5, 5), 1), {"score": "gain_offset"}),
     ]
@@ -365,7 +365,7 @@ def test_templates_without_contrast_or_not_finite_are_refused(device: Device) ->
     plan = SsdSearch(device, (61, 83), (7, 5), (20, 57), 2, dtype=np.float32, score="gain_offset")
     with pytest.raises(TrackingError, match=r"one grey level, 0\.5"):
         plan.set_template(0, np.full((7, 5), 0.5, np.float32))
-    with pytest.raises(InputError, match="not finite"):
+    with pytest.raises(InputError, match="value of nan: finite levels"):
         plan.set_template(0, np.full((7, 5), np.nan, np.float32))
 
 

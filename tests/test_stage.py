@@ -50,10 +50,10 @@ def moves(received: list[bytes]) -> list[bytes]:
     return [line for line in received if line.startswith(MOTION)]
 
 
-@pytest.mark.parametrize("wire", ["tcp", "pty", "usb"])
+@pytest.mark.parametrize("wire", ["tcp", "pty", "usb", "ftdi"])
 def test_a_move_arrives_where_it_was_sent_over_every_wire(wire: str) -> None:
-    if wire == "pty":
-        pytest.importorskip("serial")
+    if wire in ("pty", "ftdi"):
+        pytest.importorskip({"pty": "serial", "ftdi": "pyftdi"}[wire])
     with gcs_rig(wire=wire) as rig:
         rig.stage.move_to({"x": 13000.0, "y": 11000.0})
         rig.stage.wait_until_still()
@@ -130,6 +130,109 @@ def test_a_velocity_expires_when_the_host_falls_silent() -> None:
         rig.clock.wait(10.0)
         assert not rig.engine.moving
         assert rig.stage.position()["x"] - start == pytest.approx(250.0, abs=STEP_UM)
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.1, 0.45])
+def test_a_long_move_ends_soon_when_the_host_falls_silent(after_s: float) -> None:
+    with gcs_rig() as rig:
+        start = rig.stage.position()["x"]
+        rig.stage.move_to({"x": 24000.0}, speed=1000.0)
+        rig.clock.wait(after_s)
+        rig.clock.hang(20.0)
+        assert not rig.engine.moving
+        # A quarter of a second of the speed, from the last renewal on.
+        renewed_s = math.floor(after_s / 0.1 + 1e-9) * 0.1
+        gone_um = rig.engine.position["1"] * 1e3 - start
+        assert gone_um <= 1000.0 * (renewed_s + 0.25) + STEP_UM
+        assert gone_um >= 1000.0 * renewed_s
+
+
+def test_a_long_move_runs_at_its_speed_and_arrives_though_nobody_asks() -> None:
+    with gcs_rig() as rig:
+        start = rig.stage.position()["x"]
+        rig.stage.move_to({"x": start + 4000.0}, speed=1000.0)
+        # Half of the ramps' 20 ms each, and the end of a step.
+        rig.clock.wait(4.0 + 0.02 + 0.002)
+        assert rig.engine.position["1"] * 1e3 - start == pytest.approx(4000.0, abs=STEP_UM)
+        rig.stage.wait_until_still()
+
+
+def test_a_host_that_was_late_goes_on_and_calls_no_axis_stuck() -> None:
+    with gcs_rig() as rig:
+        rig.stage.move_to({"x": 20000.0}, speed=2000.0)
+        for _ in range(3):
+            rig.clock.wait(0.35)
+            rig.clock.hang(3.0)
+            rig.stage.position()
+        rig.stage.wait_until_still()
+        assert rig.stage.position()["x"] == pytest.approx(20000.0, abs=STEP_UM)
+
+
+def test_another_axis_may_be_sent_on_its_way_without_ending_the_first_move() -> None:
+    with gcs_rig() as rig:
+        rig.stage.move_to({"x": 16000.0}, speed=2000.0)
+        rig.clock.wait(0.3)
+        rig.stage.move_to({"y": 9000.0}, speed=300.0)
+        rig.clock.wait(0.3)
+        rig.stage.set_velocity({"y": -100.0})
+        rig.stage.wait_until_still()
+        assert rig.stage.position()["x"] == pytest.approx(16000.0, abs=STEP_UM)
+        assert rig.stage.position()["y"] > 9000.0  # its move ended when it was given a velocity
+
+
+def test_what_fails_while_nobody_asks_opens_the_latch_and_is_raised_by_the_next_question() -> None:
+    with gcs_rig() as rig:
+        rig.engine.motors["1"].stuck = True
+        rig.stage.move_to({"x": 20000.0})
+        rig.clock.wait(1.0)
+        assert not rig.stage.latch.armed
+        with pytest.raises(FollowingError, match=r"x stands .* stalled"):
+            rig.stage.wait_until_still()
+        rig.engine.motors["1"].stuck = False
+        arm(rig.stage)
+        rig.stage.move_to({"x": 13000.0})
+        rig.stage.wait_until_still()
+
+
+def test_a_latch_opened_by_another_ends_a_long_move_and_is_told_apart_from_an_arrival() -> None:
+    with gcs_rig() as rig:
+        rig.stage.move_to({"x": 20000.0})
+        rig.clock.wait(0.15)
+        rig.stage.latch.trip("the other stage was lost")
+        rig.clock.wait(5.0)
+        assert not rig.engine.moving
+        assert rig.engine.position["1"] < 14.0
+        with pytest.raises(StoppedError, match="the other stage was lost"):
+            rig.stage.wait_until_still()
+
+
+def test_a_wait_that_is_interrupted_ends_the_move() -> None:
+    with gcs_rig() as rig:
+        rig.stage.move_to({"x": 20000.0})
+
+        def interrupted(_duration_s: float) -> None:
+            raise KeyboardInterrupt
+
+        rig.clock.wait, wait = interrupted, rig.clock.wait  # type: ignore[method-assign]
+        with pytest.raises(KeyboardInterrupt):
+            rig.stage.wait_until_still()
+        rig.clock.wait = wait  # type: ignore[method-assign]
+        never_arrives(rig)
+
+
+@pytest.mark.parametrize("kind", ["lose", "garble", "disconnect", "error"])
+def test_a_fault_met_by_a_renewal_leaves_the_stage_at_rest(kind: str) -> None:
+    with gcs_rig(wire="usb", timeout_s=0.05) as rig:
+        rig.stage.move_to({"x": 20000.0})
+        fault = Fault(kind, at=1 if kind == "error" else 0, amount=17)  # type: ignore[arg-type]
+        rig.engine.faults = FaultSchedule([fault])
+        rig.clock.wait(0.1)
+        assert not rig.stage.latch.armed
+        rig.clock.wait(10.0)
+        assert not rig.engine.moving
+        assert rig.engine.position["1"] < 14.0
+        with pytest.raises(DriverError):
+            rig.stage.wait_until_still()
 
 
 def test_repeated_velocities_run_at_the_velocity_that_was_asked_for() -> None:
@@ -373,19 +476,23 @@ def never_arrives(rig: Rig) -> None:
     assert rig.engine.position["1"] < 19.0
 
 
-def test_a_stage_whose_program_is_killed_stops_by_itself_where_its_velocity_expires() -> None:
-    program = """
+@pytest.mark.parametrize(
+    "command",
+    ['stage.set_velocity({"x": 1000.0}, expires_s=0.25)', 'stage.move_to({"x": 24000.0}, speed=1000.0)'],
+)
+def test_a_stage_whose_program_is_killed_stops_by_itself(command: str) -> None:
+    program = f"""
 import sys
 from adof_drivers.gcs import GcsController
 from adof_drivers.link import Link, TcpTransport
 from adof_drivers.safety import StageAxis
 from adof_drivers.stage import Stage
 link = Link(TcpTransport("127.0.0.1", int(sys.argv[1])))
-stage = Stage(GcsController(link), {"x": StageAxis("1", "um", 1000.0, 4000.0, 0.1)})
+stage = Stage(GcsController(link), {{"x": StageAxis("1", "um", 1000.0, 4000.0, 0.1)}})
 stage.latch.operator(False)
 stage.latch.operator(True)
 while True:
-    stage.set_velocity({"x": 1000.0}, expires_s=0.25)
+    {command}
     print("driving", flush=True)
 """
     engine = GcsEngine(("1",), now_s=time.monotonic)

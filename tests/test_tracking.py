@@ -170,10 +170,10 @@ def test_what_cannot_be_a_template_is_refused() -> None:
         (image, (3, 48), {}, "leaves the image"),
         (image, (48, np.inf), {}, "finite column and row"),
         (image, (48,), {}, "finite column and row"),
-        (image, (48, 48), {"shape": (3, 20)}, "at least 4 pixels"),
+        (image, (48, 48), {"shape": (3, 20)}, "whole numbers of 4 or more"),
         (image, (48, 48), {"sigma_limit_px": 0.0}, "above 0"),
-        (image, (48, 48), {"noise": np.nan}, "finite number"),
-        (broken, (48, 48), {}, "not finite around"),
+        (image, (48, 48), {"noise": np.nan}, "grey levels were wanted"),
+        (broken, (48, 48), {}, "not finite or beyond 1e.16 around"),
         (image.astype(np.float64), (48, 48), {}, "convert it first"),
         (image[0], (48, 48), {}, "convert it first"),
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from functools import cache
@@ -9,9 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from adof_cl import reference, tradeoff
 from adof_cl.cli import main
+from adof_cl.cli.labels import label_points
 from adof_cl.device import Device
 from adof_cl.errors import InputError
 from adof_cl.loop import HOLE, PEG
@@ -98,7 +103,8 @@ def test_enough_nodes_and_small_steps_reach_the_exact_transfer_and_few_do_not() 
 def test_the_front_holds_what_nothing_beats_and_nothing_else() -> None:
     a, b = reading("k", "a", 1, 5), reading("k", "b", 2, 3)
     beaten, lost = reading("k", "c", 2.5, 4), reading("k", "d", 0.5, math.inf)
-    assert tradeoff.pareto([beaten, b, lost, a]) == [a, b]
+    untold = reading("k", "e", 3, 2.8)  # no frames tell it from b
+    assert tradeoff.pareto([beaten, b, lost, a, untold]) == [a, b]
 
 
 def test_a_knob_pays_when_less_accuracy_saves_a_tenth_and_not_otherwise() -> None:
@@ -157,14 +163,17 @@ def test_a_scene_refuses_what_no_scene_has() -> None:
 def test_a_quick_sweep_measures_every_stage_writes_a_profile_and_draws_it(
     device: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path, plots = tmp_path / "p.json", tmp_path / "plots"
-    arguments = ("--quick", "--json", path, "--plots", plots, "--device", device.facts.index)
+    path, plots, table = tmp_path / "p.json", tmp_path / "plots", tmp_path / "table.md"
+    arguments = ("--quick", "--json", path, "--plots", plots, "--table", table)
+    arguments = (*arguments, "--device", device.facts.index)
     assert run("tradeoff", *arguments) == 0
     profile = DeviceProfile.read(path)
     said = capsys.readouterr()
     assert {r.stage for r in profile.readings} == set(tradeoff.STAGES)
     assert all(r.time_s.low > 0 and r.error_um > 0 for r in profile.readings)
     assert all(r.setting in said.out for r in profile.readings)
+    written = table.read_text().splitlines()
+    assert all(any(f"| {r.setting} |" in line for line in written) for r in profile.readings)
     assert profile.fits(device.facts.as_dict())
     assert not profile.fits({**device.facts.as_dict(), "driver_version": "another"})
     assert "timing in turns" in said.err
@@ -190,6 +199,22 @@ def test_a_quick_sweep_measures_every_stage_writes_a_profile_and_draws_it(
     path.write_text("{}")
     with pytest.raises(InputError, match="not a device profile"):
         DeviceProfile.read(path)
+
+
+@pytest.mark.parametrize("crowd", [1.0, 0.1, 0.001])
+def test_names_of_points_never_lie_over_each_other_nor_outside(crowd: float) -> None:
+    rng = np.random.default_rng(4)
+    figure = Figure(figsize=(5.0, 3.5))
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(xscale="log", yscale="log", xlim=(0.005, 200.0), ylim=(0.005, 200.0))
+    points = [tuple(np.exp(crowd * rng.normal(0.0, 3.0, 2)).clip(0.01, 100).tolist()) for _ in range(25)]
+    label_points(axes, points, ["mW i" * int(rng.integers(1, 6)) for _ in points])
+    figure.draw_without_rendering()
+    boxes = [Text.get_window_extent(text) for text in axes.texts]  # without lines
+    frame = axes.get_window_extent()
+    assert all(not a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+    assert all(frame.x0 <= box.x0 and box.x1 <= frame.x1 for box in boxes)
+    assert len(boxes) >= 10
 
 
 def test_a_profile_that_was_never_made_is_asked_for(

@@ -40,6 +40,7 @@ def camera(
     packet_loss: Annotated[float, typer.Option("--packet-loss", help="Share of packets not sent.")] = 0.0,
     frame_loss: Annotated[float, typer.Option("--frame-loss", help="Share of frames not sent.")] = 0.0,
     swapped: Annotated[float, typer.Option("--swapped", help="Share of frames sent after the next.")] = 0.0,
+    garbled: Annotated[float, typer.Option("--garbled", help="Share of packets that are malformed.")] = 0.0,
     delay_s: Annotated[float, typer.Option("--delay-s", help="Frames are late by up to this.")] = 0.0,
     freeze_at: Annotated[
         int | None, typer.Option("--freeze-at", metavar="K", help="From exposure K on, one picture for ever.")
@@ -75,6 +76,7 @@ def camera(
         packet_loss=packet_loss,
         frame_loss=frame_loss,
         swapped=swapped,
+        garbled=garbled,
         delay_s=delay_s,
         freeze_at=freeze_at,
         stall_at=stall_at,
@@ -99,7 +101,7 @@ def camera(
                     shape,
                     address=here,
                     siblings=[other for other in addresses if other != here],
-                    sixteen_bit=sixteen_bit,
+                    pixel_format="Mono16" if sixteen_bit else "Mono8",
                     rate_hz=rate_hz,
                     faults=faults,
                 )

@@ -16,6 +16,7 @@ from adof_cl.errors import InputError
 class _Protocol(StrEnum):
     GCS = "gcs"
     PICOMOTOR = "picomotor"
+    GCODE = "gcode"
 
 
 def stage(
@@ -40,6 +41,7 @@ def stage(
     """
     from adof_drivers.emulators.engine import Engine
     from adof_drivers.emulators.faults import FaultSchedule
+    from adof_drivers.emulators.gcode import GcodeEngine
     from adof_drivers.emulators.gcs import GcsEngine
     from adof_drivers.emulators.picomotor import PicomotorEngine
     from adof_drivers.emulators.serve import Served
@@ -48,11 +50,14 @@ def stage(
     if not (colon and number.isascii() and number.isdigit() and int(number) < 65536):
         raise InputError(f"--tcp is {tcp!r}: HOST:PORT was wanted, as 127.0.0.1:50000")
     schedule = FaultSchedule.seeded(seed, count=faults, lines=1000)
-    engine: Engine = (
-        GcsEngine([str(i + 1) for i in range(axes)], now_s=time.monotonic, faults=schedule)
-        if protocol is _Protocol.GCS
-        else PicomotorEngine(now_s=time.monotonic, faults=schedule)
-    )
+    engine: Engine
+    match protocol:
+        case _Protocol.GCS:
+            engine = GcsEngine([str(i + 1) for i in range(axes)], now_s=time.monotonic, faults=schedule)
+        case _Protocol.PICOMOTOR:
+            engine = PicomotorEngine(now_s=time.monotonic, faults=schedule)
+        case _Protocol.GCODE:
+            engine = GcodeEngine(now_s=time.monotonic, faults=schedule)
     with Served.pty(engine) if pty else Served.tcp(engine, host, int(number)) as served:
         where = {
             "device": "stage",

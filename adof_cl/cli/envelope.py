@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,6 +11,9 @@ import typer
 from adof_cl.cli.devices import DeviceOption
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
+
     from adof_cl.device import DeviceFacts
     from adof_cl.envelope import Outcome
 
@@ -128,6 +132,15 @@ def markdown(facts: DeviceFacts, outcomes: list[Outcome]) -> str:
             f"| {outcome.row.name} | {outcome.storage} | {len(outcome.points)} | {outcome.refusals} | "
             f"{_cell(outcome.row.measure)} | {numbers} | {'yes' if outcome.ok else '**no**'} |"
         )
+    cases = [
+        f"| {outcome.row.name} | {outcome.storage} | {_cell(_place(p.at))} | {p.error:.1e} | {p.bound:.1e} |"
+        for outcome in outcomes
+        if outcome.row.axis == "case"
+        for p in outcome.points
+        if not p.refused
+    ]
+    if cases:
+        lines += ["", "| row | in | case | error | its bound |", "|---|---|---|---|---|", *cases]
     return "\n".join(lines) + "\n"
 
 
@@ -136,47 +149,103 @@ def _cell(text: str) -> str:
 
 
 def draw(facts: DeviceFacts, outcomes: list[Outcome], folder: Path) -> list[Path]:
-    """Draw every row whose points lie on a number's axis: errors as dots, the bound as a line."""
-    import math
+    """Draw every row whose points lie on a number's axis: errors as dots, the bound as a line.
 
+    One picture for each row, and `envelope.png` with all of them.
+    """
     from matplotlib.figure import Figure
 
     from adof_cl.files import whole_file
 
-    paths = []
-    for name in dict.fromkeys(outcome.row.name for outcome in outcomes):
-        shown = [outcome for outcome in outcomes if outcome.row.name == name]
-        figure = Figure(figsize=(7.5, 4.2), layout="constrained")
-        axes = figure.add_subplot()
-        drawn: list[float] = []
-        for index, outcome in enumerate(shown):
-            answers = sorted(
-                (float(p.at), p.error, p.bound)
-                for p in outcome.points
-                if not isinstance(p.at, str) and math.isfinite(p.at) and not p.refused and not p.failure
-            )
-            if len(answers) < 3 or max(bound for _, _, bound in answers) <= 0:
-                continue
-            at, errors, bounds = zip(*answers, strict=True)
-            drawn += at
-            least = min(b for b in bounds if b > 0) * 1e-4
-            axes.plot(
-                at, [max(e, least) for e in errors], ".", ms=4, color=f"C{index}", label=outcome.storage
-            )
-            axes.plot(at, bounds, "-", lw=1, color=f"C{index}", label=f"{outcome.storage}, bound")
-        if not drawn:
-            continue
-        if max(drawn) > 1000 or 0 < max(map(abs, drawn)) < 0.01:
-            below = min((abs(x) for x in drawn if x), default=1.0)
-            axes.set_xscale("symlog", linthresh=below)
-        axes.set_yscale("log")
-        axes.grid(linewidth=0.4)
-        axes.set_xlabel(shown[0].row.axis)
-        axes.set_ylabel(shown[0].row.measure)
-        axes.set_title(f"{name}: error against {shown[0].row.axis}, {facts.platform}", fontsize=10)
-        axes.legend(fontsize=8)
+    def write(figure: Figure, name: str) -> Path:
         path = folder / f"{name}.png"
         with whole_file(path) as temporary:
             figure.savefig(temporary, dpi=110)
-        paths.append(path)
+        return path
+
+    names = dict.fromkeys(outcome.row.name for outcome in outcomes)
+    rows = [[outcome for outcome in outcomes if outcome.row.name == name] for name in names]
+    drawn = [shown for shown in rows if any(len(_answers(outcome)) > 1 for outcome in shown)]
+    paths = []
+    for shown in drawn:
+        figure = Figure(figsize=(7.5, 4.2), layout="constrained")
+        _panel(figure.add_subplot(), shown)
+        figure.suptitle(f"{shown[0].row.name}, {facts.platform}", fontsize=10)
+        figure.legend(*_marks(shown), fontsize=8, loc="outside lower center", ncols=4)
+        paths.append(write(figure, shown[0].row.name))
+    if drawn:
+        across = min(3, len(drawn))
+        down = -(-len(drawn) // across)
+        figure = Figure(figsize=(5.2 * across, 3.2 * down + 0.8), layout="constrained")
+        for index, shown in enumerate(drawn):
+            axes = figure.add_subplot(down, across, index + 1)
+            _panel(axes, shown)
+            axes.set_title(shown[0].row.name, fontsize=10)
+        figure.suptitle(f"Errors and their bounds: {facts.platform}, {facts.driver_version}")
+        figure.legend(*_marks(outcomes), fontsize=9, loc="outside lower center", ncols=4)
+        paths.append(write(figure, "envelope"))
     return paths
+
+
+_COLOURS = {"float32": "C0", "float64": "C1", "half": "C2"}
+
+
+def _answers(outcome: Outcome) -> list[tuple[float, float, float]]:
+    """Return (at, error, bound) of the answer nearest its bound at each number of the axis, in order."""
+    nearest: dict[float, tuple[float, float, float]] = {}
+    for p in outcome.points:
+        if not isinstance(p.at, str) and math.isfinite(p.at) and p.bound > 0 and math.isfinite(p.error):
+            kept = nearest.get(p.at)
+            if kept is None or p.error / p.bound > kept[1] / kept[2]:
+                nearest[p.at] = (float(p.at), p.error, p.bound)
+    return [nearest[at] for at in sorted(nearest)]
+
+
+def _panel(axes: Axes, shown: list[Outcome]) -> None:
+    places: list[float] = []
+    for outcome in shown:
+        answers = _answers(outcome)
+        if not answers:
+            continue
+        at, errors, bounds = zip(*answers, strict=True)
+        places += at
+        colour = _COLOURS[outcome.storage]
+        floor = min(bounds) * 1e-4  # an error of 0 has no place on a logarithmic axis
+        axes.plot(at, [max(error, floor) for error in errors], ".", ms=4, color=colour)
+        axes.plot(at, bounds, "-", lw=1, color=colour)
+    axes.set_yscale("log")
+    axes.grid(linewidth=0.4)
+    axes.set_xlabel(shown[0].row.axis)
+    axes.set_ylabel(shown[0].row.measure, fontsize=9)
+    if max(places) > 1000 or 0 < max(map(abs, places)) < 0.01:
+        _powers(axes, places)
+
+
+def _powers(axes: Axes, places: list[float]) -> None:
+    """Make the axis logarithmic on both sides of 0 where it has them, with a few powers of ten as ticks."""
+    sizes = [abs(at) for at in places if at]
+    low, high = math.floor(math.log10(min(sizes))), math.ceil(math.log10(max(sizes)))
+    signed = min(places) < 0
+    step = max(-(-(high - low) // (3 if signed else 5)), 1)
+    powers = range(high, low - 1, -step)
+    ticks = [(10.0**power, f"$10^{{{power}}}$") for power in powers]
+    if signed:
+        ticks += [(-at, f"$-{label[1:]}") for at, label in ticks]
+    if min(places) <= 0:
+        axes.set_xscale("symlog", linthresh=10.0**low, linscale=(high - low) / 8)
+        ticks = [tick for tick in ticks if abs(tick[0]) > 10.0**low] + [(0.0, "0")]
+        axes.set_xlim(min(places) * 2 if signed else -0.3 * 10.0**low, max(places) * 2)
+    else:
+        axes.set_xscale("log")
+    axes.set_xticks([at for at, _ in ticks], [label for _, label in ticks])
+    axes.minorticks_off()
+
+
+def _marks(shown: list[Outcome]) -> tuple[list[Line2D], list[str]]:
+    """Return the legend: which colour is which storage, and that lines are bounds."""
+    from matplotlib.lines import Line2D
+
+    storages = [name for name in _COLOURS if any(outcome.storage == name for outcome in shown)]
+    marks = [Line2D([], [], color=_COLOURS[name], marker=".", ls="") for name in storages]
+    marks.append(Line2D([], [], color="0.3", lw=1))
+    return marks, [*storages, "bound"]

@@ -32,26 +32,31 @@ def plan(
         Path | None,
         typer.Option("--profile", metavar="FILE", help="Of adof tradeoff --json; default: the device's own."),
     ] = None,
+    now: Annotated[
+        bool, typer.Option("--now", help="Time the device first; state times at the machine's pace now.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the plan as JSON.")] = False,
     device: DeviceOption = None,
 ) -> None:
     """Choose mask, restoration, windows and search for a scene on this device: the cheapest precise enough.
 
     Says for each choice what it costs and how far off it is, and what is left out and why that is safe. Exits
-    2 when no plan meets the budget, and says what the nearest possible one is.
+    2 when no plan meets the budget, and says what the nearest possible one is. Times are those of the machine
+    when it was profiled; with --now, of the machine as busy as it is.
 
     Examples: adof plan scene.json --max-error-um 2 | adof plan scene.json --max-ms 3 --phase approach --json
     """
     from dataclasses import replace
 
-    from adof_cl.cli.profiles import profile_for
+    from adof_cl.cli.profiles import planner_for, profile_for
     from adof_cl.planner import Planner
     from adof_cl.scene import Scene
 
     stated = Scene.read(scene)
     if phase is not None:
         stated = replace(stated, phase=phase)
-    chosen = Planner(profile_for(profile, device)).plan(stated, max_error_um=max_error_um, max_ms=max_ms)
+    planner = planner_for(profile, device) if now else Planner(profile_for(profile, device))
+    chosen = planner.plan(stated, max_error_um=max_error_um, max_ms=max_ms)
     if as_json:
         print(json.dumps(as_dict(chosen), indent=1))
     else:

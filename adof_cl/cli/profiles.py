@@ -1,4 +1,4 @@
-"""The profile that plans are made from: a file's, or the one kept of the chosen device."""
+"""What plans are made from: a file's profile, or the one kept of the chosen device; and its pace today."""
 
 from __future__ import annotations
 
@@ -6,7 +6,31 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from adof_cl.planner import Planner
     from adof_cl.profile import DeviceProfile
+
+_FELT = 0.1  # a pace this far from 1 is told
+
+
+def planner_for(path: Path | None, selector: str | None) -> Planner:
+    """Return a planner at the chosen device's pace now; says on standard error when that is another.
+
+    Raises
+    ------
+    InputError
+        As `profile_for`.
+    """
+    import sys
+
+    from adof_cl.device import Device
+    from adof_cl.pace import pace
+    from adof_cl.planner import Planner
+
+    profile = profile_for(path, selector)
+    now = pace(Device.open(selector), profile)
+    if abs(now - 1) > _FELT:
+        print(f"adof: this machine takes {now:.2f} times as long as when it was profiled", file=sys.stderr)
+    return Planner(profile, now)
 
 
 def profile_for(path: Path | None, selector: str | None) -> DeviceProfile:

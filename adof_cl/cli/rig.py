@@ -35,9 +35,11 @@ def rig(
 
     Examples: adof rig check rig.toml, adof rig check rig.toml --move, adof rig check rig.toml --json
     """
-    from adof_drivers.rig import check, load
+    from adof_cl.cli.live_rig import TABLES
+    from adof_drivers.rig import Section, check, load
 
-    sections = load(file)
+    named = load(file, tables=TABLES)
+    sections = {name: section for name, section in named.items() if isinstance(section, Section)}
     if move and not yes:
         typer.confirm("Stages will move by 20 steps. Is the way clear?", abort=True, err=True)
     with Live(f"{file}: {len(sections)} devices") as live:

@@ -13,8 +13,9 @@ from adof_cl.errors import InputError
 from adof_cl.twin.clock import Clock
 from adof_cl.twin.design import AxisDesign, Design, HolePlate, Peg
 from adof_cl.twin.devices import Frame, SimulatedCamera, SimulatedSlm
+from adof_cl.twin.recorded import RecordedStage
 from adof_cl.twin.stages import SimulatedStage
-from adof_cl.twin.world import Contact, Misalignment, Pose, Start, Truth, World
+from adof_cl.twin.world import Axes, Contact, Misalignment, Pose, Start, Time, Truth, World
 
 __all__ = [
     "AxisDesign",
@@ -26,6 +27,7 @@ __all__ = [
     "Misalignment",
     "Peg",
     "Pose",
+    "RecordedStage",
     "SimulatedCamera",
     "SimulatedSlm",
     "SimulatedStage",
@@ -34,6 +36,7 @@ __all__ = [
     "Twin",
     "World",
     "build",
+    "lit",
 ]
 
 
@@ -79,25 +82,12 @@ def build(
     InputError
         A negative seed, or a stop that does not fit the panel.
     """
-    if seed < 0:
-        raise InputError(f"seed is {seed}: 0 or more was wanted")
     design = design or Design()
-    rng = np.random.default_rng([seed, 100])
-    drawn_start, drawn_misalignment = Start.drawn(rng, design), Misalignment.drawn(rng)
     clock = Clock()
     coarse = SimulatedStage(design.coarse, clock, design.command_latency_s)
     fine = SimulatedStage(design.fine, clock, design.command_latency_s)
     slm = SimulatedSlm(design.panel, design.optics_1.aperture_um, clock, design.settling_s, pixels=slm_pixels)
-    world = World(
-        design,
-        misalignment or drawn_misalignment,
-        start or drawn_start,
-        clock,
-        coarse,
-        fine,
-        slm.acting,
-        seed,
-    )
+    world = lit(seed, design, clock, coarse, fine, slm, start=start, misalignment=misalignment)
     return Twin(
         seed=seed,
         design=design,
@@ -108,4 +98,32 @@ def build(
         slm=slm,
         coarse=coarse,
         fine=fine,
+    )
+
+
+def lit(
+    seed: int,
+    design: Design,
+    clock: Time,
+    coarse: Axes,
+    fine: Axes,
+    slm: SimulatedSlm,
+    *,
+    start: Start | None = None,
+    misalignment: Misalignment | None = None,
+) -> World:
+    """Return the world that `build` makes of a seed, on these stages and through this modulator."""
+    if seed < 0:
+        raise InputError(f"seed is {seed}: 0 or more was wanted")
+    rng = np.random.default_rng([seed, 100])
+    drawn_start, drawn_misalignment = Start.drawn(rng, design), Misalignment.drawn(rng)
+    return World(
+        design,
+        misalignment or drawn_misalignment,
+        start or drawn_start,
+        clock,
+        coarse,
+        fine,
+        slm.acting,
+        seed,
     )

@@ -12,7 +12,7 @@ from adof_cl.errors import InputError
 from adof_cl.optics import SlmPanel
 from adof_cl.twin.clock import Clock
 from adof_cl.twin.pupil import Pupil, read_codes
-from adof_cl.twin.world import World
+from adof_cl.twin.world import Time, World
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class SimulatedSlm:
     """A phase panel that shows 8-bit codes and takes its time to change."""
 
     def __init__(
-        self, panel: SlmPanel, aperture_um: float, clock: Clock, settling_s: float, *, pixels: bool = True
+        self, panel: SlmPanel, aperture_um: float, clock: Time, settling_s: float, *, pixels: bool = True
     ) -> None:
         self.panel = panel
         self.settling_s = settling_s
@@ -72,11 +72,14 @@ class SimulatedSlm:
         """
         self._loaded = self._read(codes)
 
-    def show(self, codes: NDArray[np.uint8] | None = None) -> None:
-        """Show the loaded pattern, or load and show this one; it is there `settling_s` later."""
+    def show(self, codes: NDArray[np.uint8] | None = None, *, since_s: float | None = None) -> None:
+        """Show the loaded pattern, or load and show this one; it is there `settling_s` later.
+
+        `since_s`: it has been shown since then, though it is told only now.
+        """
         if codes is not None:
             self.load(codes)
-        self._shown.append((self._clock.now_s, self._loaded))
+        self._shown.append((self._clock.now_s if since_s is None else since_s, self._loaded))
 
     def acting(self, from_s: float, to_s: float) -> list[tuple[float, Pupil]]:
         """Return the patterns that act between two times with their shares: two while it settles."""
@@ -157,9 +160,10 @@ class SimulatedCamera:
         start_s = number * period_s
         self._clock.wait_until(start_s + design.exposure_s)
         self._last = number
-        return Frame(self._expose(number, start_s), number, start_s + design.exposure_s / 2, self._origin_yx)
+        return Frame(self.expose(number, start_s), number, start_s + design.exposure_s / 2, self._origin_yx)
 
-    def _expose(self, number: int, start_s: float) -> NDArray[np.uint8]:
+    def expose(self, number: int, start_s: float) -> NDArray[np.uint8]:
+        """Return exposure `number`, begun at `start_s`; waits for nothing."""
         design = self._world.design
         image = self._world.radiance(
             self.number, start_s, start_s + design.exposure_s, self._origin_yx, self._shape

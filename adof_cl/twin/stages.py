@@ -115,6 +115,10 @@ class SimulatedStage:
         """Read every axis now."""
         return {name: float(axis.at(self._clock.now_s)) for name, axis in self.axes.items()}
 
+    def position_at(self, time_s: float) -> dict[str, float]:
+        """Return where every axis was at a time that has passed."""
+        return {name: float(axis.at(time_s)) for name, axis in self.axes.items()}
+
     @property
     def moving(self) -> bool:
         """Whether anything moves or is about to."""

@@ -3,24 +3,44 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adof_cl.errors import InputError
 from adof_cl.optics import require_finite
-from adof_cl.twin.clock import Clock
 from adof_cl.twin.design import START_REACH_UM, Design, camera_matrix
 from adof_cl.twin.parts import BACKGROUND, Painted, paint_peg, paint_plate
 from adof_cl.twin.pupil import Pupil
 from adof_cl.twin.render import Layer
-from adof_cl.twin.stages import SimulatedStage
 
 _CONTACT_STEP_S = 0.001
 
 Blend = Callable[[float, float], list[tuple[float, Pupil]]]
+
+
+class Course(Protocol):
+    """Where an axis is at any time, past or planned."""
+
+    def at(self, time_s: float | NDArray[np.float64]) -> NDArray[np.float64]: ...  # noqa: D102
+
+
+class Axes(Protocol):
+    """A stage as the world sees it."""
+
+    @property
+    def axes(self) -> Mapping[str, Course]: ...  # noqa: D102
+
+
+class Time(Protocol):
+    """A clock that tells of every interval that passed."""
+
+    @property
+    def now_s(self) -> float: ...  # noqa: D102
+    def on_advance(self, listener: Callable[[float, float], None]) -> None: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -171,9 +191,9 @@ class World:
         design: Design,
         misalignment: Misalignment,
         start: Start,
-        clock: Clock,
-        coarse: SimulatedStage,
-        fine: SimulatedStage,
+        clock: Time,
+        coarse: Axes,
+        fine: Axes,
         modulator: Blend,
         seed: int,
     ) -> None:

@@ -57,6 +57,9 @@ class GcsController:
         It does not answer, or not as it should.
     """
 
+    rest_s = None
+    blind = False
+
     def __init__(self, link: Link, axes: Collection[str] | None = None) -> None:
         self._link = link
         self._cleared = link.interrupts
@@ -162,6 +165,10 @@ class GcsController:
     def stop(self) -> None:
         """Send the single byte 24: at once, from any thread."""
         self._link.interrupt(STOP)
+
+    def emergency_stop(self) -> None:
+        """Stop likewise: the drives stay on, or the axes would fall."""
+        self.stop()
 
     def close(self) -> None:
         """Close the link."""

@@ -1,4 +1,4 @@
-r"""Bytes to a device and back: TCP, USB bulk, serial. One request at a time; a stop waits for none.
+r"""Bytes to a device and back: TCP, USB bulk, FTDI, serial. One request at a time; a stop waits for none.
 
     with Link(TcpTransport("192.168.0.20", 50000)) as link:
         link.exchange(b"*IDN?\n", whole=lambda reply: reply.endswith(b"\n"))
@@ -11,6 +11,7 @@ request is refused until the device is opened anew, only `interrupt` still goes 
 from __future__ import annotations
 
 import itertools
+import logging
 import select
 import socket
 import time
@@ -123,31 +124,10 @@ class UsbTransport:
         import usb.core
         import usb.util
 
-        self.name = f"USB {vendor:04x}:{'*' if product is None else f'{product:04x}'}"
+        self.name, self._device = _usb_device(vendor, product, serial_number, backend)
         self._gone = usb.core.USBError
         self._late = usb.core.USBTimeoutError
         self._util = usb.util
-        wanted = {"idVendor": vendor} | ({} if product is None else {"idProduct": product})
-        try:
-            found = list(usb.core.find(find_all=True, backend=backend, **wanted) or ())
-            if serial_number is not None:
-                found = [device for device in found if device.serial_number == serial_number]
-        except usb.core.NoBackendError:
-            raise LinkError("libusb is not installed: USB devices cannot be opened without it") from None
-        except (usb.core.USBError, ValueError) as failure:
-            raise LinkError(f"{self.name} cannot be read ({failure}): check its access rights") from None
-        if len(found) != 1:
-            raise LinkError(
-                f"{len(found)} devices are {self.name}"
-                + (f" with serial number {serial_number}" if serial_number else "")
-                + ": one was wanted, so check cable and power, or give a serial number"
-            )
-        self._device = found[0]
-        try:
-            if self._device.is_kernel_driver_active(0):
-                self._device.detach_kernel_driver(0)
-        except (NotImplementedError, usb.core.USBError):
-            pass  # no kernel driver to speak of; claiming says whether that matters
         try:
             self._device.set_configuration()
             interface = self._device.get_active_configuration()[(0, 0)]
@@ -191,6 +171,123 @@ class UsbTransport:
     def close(self) -> None:
         """Release the device."""
         self._util.dispose_resources(self._device)
+
+
+class FtdiTransport:
+    """A UART behind an FTDI bridge, by pyftdi (extra `ftdi`): two bytes of status go before every packet.
+
+    The bridge keeps what is short of a packet for 1 ms; as delivered, for 16 ms.
+
+    Parameters
+    ----------
+    vendor, product, serial_number, backend
+        As for `UsbTransport`; any FTDI identity, and those that vendors gave their own.
+
+    Raises
+    ------
+    LinkError
+        pyftdi is missing, or as for `UsbTransport`.
+    """
+
+    LATENCY_MS = 1
+    WRITE_TIMEOUT_MS = 100
+    READ_TIMEOUT_MS = 100
+
+    def __init__(
+        self,
+        vendor: int,
+        product: int | None = None,
+        *,
+        baud: int = 115200,
+        serial_number: str | None = None,
+        backend: Any = None,
+    ) -> None:
+        try:
+            from pyftdi.ftdi import Ftdi, FtdiError
+        except ImportError:
+            raise LinkError("pyftdi is not installed: pip install 'adof-cl[ftdi]'") from None
+        import usb.core
+        import usb.util
+
+        self.name, self._device = _usb_device(vendor, product, serial_number, backend)
+        self.name = f"FTDI {self.name}"
+        self._failures = (FtdiError, usb.core.USBError)
+        self._util = usb.util
+        self._bridge = Ftdi()
+        try:
+            self._device.set_configuration()
+            usb.util.claim_interface(self._device, 0)
+            self._bridge.open_from_device(self._device)
+            self._bridge.timeouts = (self.READ_TIMEOUT_MS, self.WRITE_TIMEOUT_MS)
+            self._bridge.set_baudrate(baud)
+            self._bridge.set_line_property(8, 1, "N")
+            self._bridge.set_flowctrl("")
+            self._bridge.set_latency_timer(self.LATENCY_MS)
+        except (*self._failures, ValueError) as failure:
+            self._util.dispose_resources(self._device)
+            raise LinkError(
+                f"{self.name} cannot be claimed as a bridge at {baud} baud ({failure}): another program may "
+                "hold it, or it is none"
+            ) from None
+
+    def write(self, data: bytes) -> None:
+        """Send all of it at once."""
+        try:
+            self._bridge.write_data(data)
+        except self._failures as failure:
+            raise LinkError(f"{self.name} takes no bytes ({failure}): it has to be opened again") from None
+
+    def read_some(self, timeout_s: float) -> bytes:
+        """Return what is there, b"" after the time-out."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                # A packet of status alone comes each time the latency is over.
+                data = bytes(self._bridge.read_data(4096))
+            except self._failures as failure:
+                raise LinkError(f"{self.name} is gone ({failure}): open it again") from None
+            if data or time.monotonic() >= deadline:
+                return data
+
+    def close(self) -> None:
+        """Release the device; may be called again."""
+        logging.getLogger("pyftdi.ftdi").addFilter(lambda _record: False)  # it may be gone, which was said
+        self._bridge.close()
+        self._util.dispose_resources(self._device)
+
+
+def _usb_device(vendor: int, product: int | None, serial_number: str | None, backend: Any) -> tuple[str, Any]:
+    """Find the one device that is meant, take it from the kernel's driver, and return its name and itself.
+
+    Raises
+    ------
+    LinkError
+        No libusb, no such device, several of them, or no access.
+    """
+    import usb.core
+
+    name = f"USB {vendor:04x}:{'*' if product is None else f'{product:04x}'}"
+    wanted = {"idVendor": vendor} | ({} if product is None else {"idProduct": product})
+    try:
+        found = list(usb.core.find(find_all=True, backend=backend, **wanted) or ())
+        if serial_number is not None:
+            found = [device for device in found if device.serial_number == serial_number]
+    except usb.core.NoBackendError:
+        raise LinkError("libusb is not installed: USB devices cannot be opened without it") from None
+    except (usb.core.USBError, ValueError) as failure:
+        raise LinkError(f"{name} cannot be read ({failure}): check its access rights") from None
+    if len(found) != 1:
+        raise LinkError(
+            f"{len(found)} devices are {name}"
+            + (f" with serial number {serial_number}" if serial_number else "")
+            + ": one was wanted, so check cable and power, or give a serial number"
+        )
+    try:
+        if found[0].is_kernel_driver_active(0):
+            found[0].detach_kernel_driver(0)
+    except (NotImplementedError, usb.core.USBError):
+        pass  # no kernel driver to speak of; claiming says whether that matters
+    return name, found[0]
 
 
 class SerialTransport:
@@ -280,6 +377,7 @@ class Link:
         *,
         since: int | None = None,
         first: Sequence[bytes] = (),
+        timeout_s: float | None = None,
     ) -> bytes:
         """Send a request and return its reply, every byte of it.
 
@@ -292,6 +390,8 @@ class Link:
         since
             For requests that move: the value of `interrupts` when the command began. An interrupt since then
             refuses the request; one that comes while it is sent is sent again behind it.
+        timeout_s
+            For requests that take longer than the link's.
 
         Raises
         ------
@@ -306,13 +406,15 @@ class Link:
             if since is not None and self._interrupts != since:
                 raise StoppedError(f"{self.transport.name} was stopped meanwhile: nothing was sent")
             try:
-                return self._exchange((*first, request), whole, since)
+                return self._exchange(
+                    (*first, request), whole, since, self.timeout_s if timeout_s is None else timeout_s
+                )
             except DriverError as failure:
                 self._broken = str(failure)
                 raise
 
     def _exchange(
-        self, requests: Sequence[bytes], whole: Callable[[bytes], bool], since: int | None
+        self, requests: Sequence[bytes], whole: Callable[[bytes], bool], since: int | None, timeout_s: float
     ) -> bytes:
         if not isinstance(self.transport, UsbTransport) and (stray := self.transport.read_some(0.0)):
             raise ReplyError(
@@ -322,16 +424,17 @@ class Link:
             self.transport.write(request)
         if since is not None and self._interrupts != since:
             self.transport.write(self._interrupt)
-        deadline = time.monotonic() + self.timeout_s
+        deadline = time.monotonic() + timeout_s
         reply = b""
         while not whole(reply):
             left_s = deadline - time.monotonic()
-            if left_s <= 0:
+            piece = self.transport.read_some(max(left_s, 0.0))
+            reply += piece
+            if left_s <= 0 and not piece:  # asked once more, after the time: the late one may be this program
                 raise ReplyTimeoutError(
                     f"{self.transport.name} gave {reply[-40:]!r} to {requests[-1][:60]!r} and no more within "
-                    f"{self.timeout_s:g} s: check cable and power"
+                    f"{timeout_s:g} s: check cable and power"
                 )
-            reply += self.transport.read_some(left_s)
             if len(reply) > LONGEST_REPLY:
                 raise ReplyError(f"{self.transport.name} does not end its reply to {requests[-1][:60]!r}")
         return reply

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from adof_drivers.errors import DriverError
 
 _TURN = 2 * math.pi
+_MOST_TURNS = 1e3
 
 
 def code_table(phase_rad: NDArray[Any]) -> NDArray[np.uint8]:
@@ -29,11 +30,16 @@ def code_table(phase_rad: NDArray[Any]) -> NDArray[np.uint8]:
     Raises
     ------
     DriverError
-        Another shape, not finite, or not one way only: codes were mixed up, or the phase was not unwrapped.
+        Another shape, not finite, more than 1000 turns, or not one way only: codes were mixed up, or the
+        phase was not unwrapped.
     """
     phase = np.asarray(phase_rad, dtype=np.float64)
     if phase.shape != (256,) or not np.isfinite(phase).all():
         raise DriverError(f"phase_rad is {phase.shape}: 256 finite numbers were wanted, one for each code")
+    if np.ptp(phase) > _MOST_TURNS * _TURN:
+        raise DriverError(
+            f"phase_rad spans {np.ptp(phase):g} rad: at most {_MOST_TURNS:g} turns was wanted: check its unit"
+        )
     steps = np.diff(phase)
     if not ((steps >= 0).all() or (steps <= 0).all()) or phase[0] == phase[-1]:
         raise DriverError(

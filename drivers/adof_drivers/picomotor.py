@@ -3,6 +3,9 @@
 Nothing measures where an axis is: its position is the count of steps sent, zero where the operator said so by
 `home`, which moves nothing. After a power cycle, or a new connection, that has to be said again.
 
+A motor in motion may refuse to be sent elsewhere ("motion in progress"), so that a new target or velocity
+waits for the end of the last: choose a velocity's expiry as short as the period at which it is renewed.
+
 Source: formats and codes as in the 8742's published command set; measured on emulators, not on hardware.
 """
 
@@ -44,6 +47,9 @@ class PicomotorController:
     LinkError, ReplyError
         It does not answer, or not as it should.
     """
+
+    rest_s = 0.0
+    blind = False
 
     def __init__(self, link: Link) -> None:
         self._link = link
@@ -121,6 +127,10 @@ class PicomotorController:
     def stop(self) -> None:
         """Abort all motion: at once, from any thread."""
         self._link.interrupt(STOP)
+
+    def emergency_stop(self) -> None:
+        """Stop likewise: the drives stay on, or the axes would fall."""
+        self.stop()
 
     def close(self) -> None:
         """Close the link."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from adof_drivers.errors import DeviceLostError, DriverError
-from adof_drivers.hid_device import HidDevice, Identity, find, open_hid
+from adof_drivers.hid_device import HidDevice, Identity, choose_hid, open_path
 
 IDENTITIES: frozenset[Identity] = frozenset([(0x16C0, 0x05DF)])
 _ON, _OFF, _ALL_OFF = 0xFF, 0xFD, 0xFC
@@ -40,12 +40,12 @@ class HidRelay:
         DriverError
             None, several, or one that does not call itself USBRelay and a number.
         """
-        there = [one for one in find(IDENTITIES) if path is None or one["path"] == path.encode()]
-        product = (there[0].get("product_string") or "") if len(there) == 1 else "USBRelay8"
+        at, listed = choose_hid("USB relay", IDENTITIES, path=path)
+        product = listed.get("product_string") or ""
         number = product.removeprefix("USBRelay")
         if not (product.startswith("USBRelay") and number.isdecimal()):
-            raise DriverError(f"16c0:05df calls itself '{product}': 'USBRelay' and a number was wanted")
-        return cls(open_hid("USB relay", IDENTITIES, path=path), int(number))
+            raise DriverError(f"{at.decode()} calls itself '{product}': 'USBRelay' and a number was wanted")
+        return cls(open_path(at), int(number))
 
     def state(self) -> tuple[bool, ...]:
         """Return which relays are on, read from the board.

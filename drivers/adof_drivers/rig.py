@@ -1,5 +1,9 @@
 """The rig file: which device is on which port, strict, with units in names; and the check of what it names.
 
+    [camera.1]
+    driver = "gige"
+    address = "192.168.0.11"
+
     [stage.coarse]
     driver = "gcs"
     tcp = "192.168.0.20:50000"
@@ -15,18 +19,26 @@ A section is a kind, a name and a driver. A driver joins by `register`, its modu
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from adof_drivers.errors import DriverError, RequestError
 
-_MODULES = ("adof_drivers.stage_sections",)
+_MODULES = (
+    "adof_drivers.camera_sections",
+    "adof_drivers.slm_sections",
+    "adof_drivers.stage_sections",
+    "adof_drivers.operator_sections",
+)
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+"""A finite number above 0."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +88,13 @@ def register(kind: str, driver: str) -> Callable[[_Class], _Class]:
     return join
 
 
-def load(path: Path) -> dict[str, Section]:
+def load(path: Path, *, tables: Mapping[str, type[BaseModel]] | None = None) -> dict[str, Any]:
     """Read a rig file: sections by "kind.name", in the file's order.
+
+    Parameters
+    ----------
+    tables
+        What else may stand in it, by name: one table each, read by its class and returned under that name.
 
     Raises
     ------
@@ -92,11 +109,15 @@ def load(path: Path) -> dict[str, Section]:
         raise RequestError(f"{path} cannot be read ({failure}): give a rig file") from None
     except tomllib.TOMLDecodeError as failure:
         raise RequestError(f"{path} is no TOML ({failure}): mend that line") from None
-    sections = {}
+    tables = tables or {}
+    sections: dict[str, Any] = {}
     for kind, devices in content.items():
+        if kind in tables:
+            sections[kind] = _read(path, kind, tables[kind], devices)
+            continue
         known = sorted(driver for of, driver in _SECTIONS if of == kind)
         if not known or not isinstance(devices, dict):
-            kinds = ", ".join(sorted({of for of, _ in _SECTIONS}))
+            kinds = ", ".join(sorted({of for of, _ in _SECTIONS} | set(tables)))
             raise RequestError(f"{path}: {kind!r} is no kind of device: {kinds} was wanted")
         for name, entry in devices.items():
             place = f"{kind}.{name}"
@@ -105,13 +126,17 @@ def load(path: Path) -> dict[str, Section]:
                 raise RequestError(
                     f"{path}: {place} has driver {driver!r}: one of {', '.join(known)} was wanted"
                 )
-            try:
-                sections[place] = _SECTIONS[kind, driver].model_validate(entry)
-            except ValidationError as failure:
-                raise RequestError(f"{path}: {_first(place, failure)}") from None
-    if not sections:
+            sections[place] = _read(path, place, _SECTIONS[kind, driver], entry)
+    if not sections.keys() - tables.keys():
         raise RequestError(f"{path} names no device: begin with a section like [stage.coarse]")
     return sections
+
+
+def _read(path: Path, place: str, model: type[BaseModel], entry: Any) -> BaseModel:
+    try:
+        return model.model_validate(entry)
+    except ValidationError as failure:
+        raise RequestError(f"{path}: {_first(place, failure)}") from None
 
 
 def _first(place: str, failure: ValidationError) -> str:

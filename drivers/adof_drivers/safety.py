@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 from typing import Literal
 
@@ -180,42 +180,98 @@ class Course:
         return same_way and self.at(other.start_s) != self.target
 
 
+@dataclass(frozen=True)
+class _Followed:
+    """A course, and where the axis may turn at the latest: it was under way when the course was given."""
+
+    course: Course
+    low: Course
+    high: Course
+
+    def between(self, time_s: float, lag_s: float) -> tuple[float, float]:
+        """Return the ends of where it may be."""
+        places = (
+            self.course.at(time_s),
+            self.course.at(time_s - lag_s),
+            self.low.at(time_s),
+            self.high.at(time_s),
+        )
+        return min(places), max(places)
+
+    def delayed(self, by_s: float) -> _Followed:
+        """Return it so much later."""
+        return _Followed(*(replace(c, start_s=c.start_s + by_s) for c in (self.course, self.low, self.high)))
+
+
 class MotionWatch:
     """Compares readings with commands: an axis stuck, lost or running away is found at the next reading.
 
-    At time t an axis may be anywhere its course was between t - lag and t, give or take `following`. A course
-    that is renewed before its end, as velocities are, begins where the axis is: one by one, none tells of an
-    axis that is stuck. So their ways are added up: each time they come to twice what an axis may be behind,
-    at least half must be gone.
+    At time t an axis may be anywhere its course was between t - lag and t, give or take `following`; one that
+    was on another course before may run on along that for the lag, and turn then. A course that is renewed
+    before its end, as velocities are, begins where the axis is: one by one, none tells of an axis that is
+    stuck. So their ways are added up: each time they come to twice what an axis may be behind, at least half
+    must be gone.
     """
 
     def __init__(self, axes: Mapping[str, StageAxis]) -> None:
         self._axes = axes
-        self._courses: dict[str, Course] = {}
-        self._runs: dict[str, tuple[float, float]] = {}  # where it began; the way ordered by earlier courses
+        self._lock = Lock()  # held for arithmetic only: a stop from another thread forgets the courses
+        self._followed: dict[str, _Followed] = {}
+        # Where it began; the way ordered by earlier courses; the fastest of them.
+        self._runs: dict[str, tuple[float, float, float]] = {}
+        self._last: dict[str, Course] = {}  # whether followed any more or not
+        self._reaches: dict[str, list[tuple[float, float, float]]] = {}  # until when; from where, to where
 
     def begin(self, courses: Mapping[str, Course]) -> None:
         """Follow these commands from now on."""
-        for name, course in courses.items():
-            began, ordered = self._runs.get(name, (course.start, 0.0))
-            before = self._courses.get(name)
-            if before is not None and before.renewed_by(course):
-                ordered += abs(before.at(course.start_s) - before.start)
-            else:
-                began, ordered = course.start, 0.0
-            self._runs[name] = began, ordered
-            self._courses[name] = course
+        with self._lock:
+            for name, course in courses.items():
+                low, high = self._reach(name, course)
+                began, ordered, fastest = self._runs.get(name, (course.start, 0.0, 0.0))
+                before = self._followed.get(name)
+                if before is not None and before.course.renewed_by(course):
+                    ordered += abs(before.course.at(course.start_s) - before.course.start)
+                else:
+                    began, ordered, fastest = low if course.target > course.start else high, 0.0, 0.0
+                turns_s = course.start_s + self._axes[name].lag_s
+                self._followed[name] = _Followed(
+                    course,
+                    *(Course(turns_s, place, course.target, course.speed) for place in (low, high)),
+                )
+                self._runs[name] = began, ordered, max(fastest, course.speed)
+                self._last[name] = course
+
+    def _reach(self, name: str, course: Course) -> tuple[float, float]:
+        """Return between where an axis may turn to a new course: those given just before carry it on."""
+        now_s, lag_s = course.start_s, self._axes[name].lag_s
+        last = self._last.get(name)
+        left = 0.0 if last is None else last.target - course.start
+        runs_on = 0.0 if last is None else math.copysign(min(abs(left), last.speed * lag_s), left)
+        if runs_on * (course.target - course.start) > 0:  # and goes on from there, slower
+            runs_on += course.at(now_s + lag_s) - course.start
+        reaches = [reach for reach in self._reaches.get(name, ()) if reach[0] > now_s]
+        reaches.append((now_s + lag_s, course.start + min(runs_on, 0.0), course.start + max(runs_on, 0.0)))
+        self._reaches[name] = reaches
+        return min(low for _, low, _ in reaches), max(high for *_, high in reaches)
+
+    def delay(self, name: str, by_s: float) -> None:
+        """Have an axis be later by so much: it stood, because nothing told it to go on."""
+        with self._lock:
+            if (followed := self._followed.get(name)) is not None:
+                self._followed[name] = followed.delayed(by_s)
 
     def leave(self, names: Collection[str]) -> None:
         """Follow these axes no longer."""
-        for name in names:
-            self._courses.pop(name, None)
-            self._runs.pop(name, None)
+        with self._lock:
+            for name in names:
+                self._followed.pop(name, None)
+                self._runs.pop(name, None)
 
     def forget(self) -> None:
         """Follow nothing: after a stop nobody knows how far an axis has run."""
-        self._courses.clear()
-        self._runs.clear()
+        with self._lock:
+            self._followed.clear()
+            self._runs.clear()
 
     def check(self, time_s: float, position: Mapping[str, float]) -> None:
         """Refuse readings that no command explains.
@@ -225,24 +281,29 @@ class MotionWatch:
         FollowingError
             The message says which axis, where it is and where it ought to be.
         """
-        for name, course in list(self._courses.items()):
-            axis = self._axes[name]
-            soon, late = course.at(time_s), course.at(time_s - axis.lag_s)
-            low, high = min(soon, late) - axis.following, max(soon, late) + axis.following
-            if not low <= position[name] <= high:
-                stands = abs(position[name] - course.start) <= axis.resolution
+        with self._lock:
+            for name, followed in self._followed.items():
+                self._check(name, followed, time_s, position[name])
+
+    def _check(self, name: str, followed: _Followed, time_s: float, at: float) -> None:
+        axis, course = self._axes[name], followed.course
+        first, last = followed.between(time_s, axis.lag_s)
+        low, high = first - axis.following, last + axis.following
+        if not low <= at <= high:
+            stands = abs(at - course.start) <= axis.resolution
+            raise FollowingError(
+                f"{name} {'stands' if stands else 'is'} at {at:.6g} {axis.unit}, where "
+                f"{low:.6g} to {high:.6g} was wanted: "
+                + ("it is stalled, so look for what holds it" if stands else "check load and speed")
+            )
+        soon = course.at(time_s)
+        began, ordered, fastest = self._runs[name]
+        ordered += abs(soon - course.start)
+        gone = math.copysign(1.0, course.target - course.start) * (at - began)
+        if ordered > 2 * (axis.following + fastest * axis.lag_s):
+            if gone < ordered / 2:
                 raise FollowingError(
-                    f"{name} {'stands' if stands else 'is'} at {position[name]:.6g} {axis.unit}, where "
-                    f"{low:.6g} to {high:.6g} was wanted: "
-                    + ("it is stalled, so look for what holds it" if stands else "check load and speed")
+                    f"{name} stands at {at:.6g} {axis.unit}: of {ordered:.6g} ordered it "
+                    f"went {gone:.6g}; it is stalled, so look for what holds it"
                 )
-            began, ordered = self._runs[name]
-            ordered += abs(soon - course.start)
-            gone = math.copysign(1.0, course.target - course.start) * (position[name] - began)
-            if ordered > 2 * (axis.following + course.speed * axis.lag_s):
-                if gone < ordered / 2:
-                    raise FollowingError(
-                        f"{name} stands at {position[name]:.6g} {axis.unit}: of {ordered:.6g} ordered it "
-                        f"went {gone:.6g}; it is stalled, so look for what holds it"
-                    )
-                self._runs[name] = position[name], -abs(soon - course.start)
+            self._runs[name] = at, -abs(soon - course.start), course.speed

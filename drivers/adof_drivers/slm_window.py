@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import socket
+import sys
 import threading
 import time
 from typing import Any
@@ -69,6 +72,23 @@ def _leave(glfw: Any) -> None:
         glfw.terminate()
 
 
+def _claim(monitor: str) -> socket.socket | None:
+    """Hold the monitor against a second program of ours: X puts one full-screen window over the other.
+
+    A name without a file, which goes with the program however it ends; Linux only.
+    """
+    if sys.platform != "linux":
+        return None
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or ""
+    claim = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        claim.bind(f"\0adof SLM on {monitor} of {display.partition('.')[0]}")
+    except OSError as failure:
+        claim.close()
+        raise DriverError(f"another program shows its patterns on {monitor}: close that one") from failure
+    return claim
+
+
 class SlmWindow:
     """Codes on a monitor's own pixels: grey on R = G = B, nothing scaled, dithered, blended or gamma-bent.
 
@@ -95,8 +115,8 @@ class SlmWindow:
     Raises
     ------
     DriverError
-        No such monitor; another resolution; a gamma ramp that is not linear; a pattern that comes back
-        changed; no pacing though required.
+        No such monitor; another resolution; another program's; a gamma ramp that is not linear; a pattern
+        that comes back changed; no pacing though required.
     """
 
     def __init__(self, shape: tuple[int, int], *, monitor: int | str, require_pacing: bool = False) -> None:
@@ -105,12 +125,14 @@ class SlmWindow:
         self._number = 0
         self._thread = threading.get_ident()
         self._window: Any = None
+        self._held: socket.socket | None = None
         self._verified = False
         _enter(glfw)
         self._entered = True
         try:
             self._monitor = self._choose(monitor)
             self._require_mode()
+            self._held = _claim(_describe(glfw, self._monitor).partition(":")[0])
             self._make_linear()
             self._window = self._create()
             self._require_framebuffer()
@@ -272,6 +294,9 @@ class SlmWindow:
         window, self._window = self._window, None
         if window is not None:
             self._glfw.destroy_window(window)
+        if self._held is not None:
+            self._held.close()
+            self._held = None
         if self._entered:
             self._entered = False
             _leave(self._glfw)

@@ -88,13 +88,14 @@ class SpaceMouse:
         self._buttons: frozenset[int] = frozenset()
         self._connected = True
         self._rested = False
+        self._pushed: list[bool | None] = [None, None]  # the first three axes, the last three, as last heard
         opened_s = clock()
         self._heard_s = [opened_s, opened_s]  # of the first three axes, of the last three
 
     @classmethod
-    def open(cls, path: str | None = None) -> SpaceMouse:
+    def open(cls, path: str | None = None, *, dead_zone: float = 0.05) -> SpaceMouse:
         """Find and open the only one, or the one at `path`."""
-        return cls(open_hid("SpaceMouse", IDENTITIES, path=path))
+        return cls(open_hid("SpaceMouse", IDENTITIES, path=path), dead_zone=dead_zone)
 
     def poll(self) -> JogState:
         """Return the wish of now; never waits, never raises."""
@@ -110,7 +111,9 @@ class SpaceMouse:
         for half in (0, 1):
             if silent[half]:
                 self._axes[3 * half : 3 * half + 3] = [0.0] * 3
-        self._rested = self._rested or (all(silent) and self._connected)
+        # A wireless puck out of reach is silent too: one that was heard deflected has to be heard at rest.
+        untouched = all(silent) and not any(self._pushed)
+        self._rested = self._rested or (untouched and self._connected)
         axes = self._axes if self._rested else [0.0] * _AXES
         x, y, z, about_x, about_y, about_z = axes
         return JogState(now_s, (x, y, z, about_x, about_y, about_z), self._buttons, self._connected)
@@ -120,24 +123,21 @@ class SpaceMouse:
         if kind == 1 and len(body) == 12:
             self._axes = self._scaled(body)
             self._heard_s = [now_s, now_s]
-            moved = True
+            self._pushed = [any(self._axes[:3]), any(self._axes[3:])]
+            self._rested = self._rested or not any(self._pushed)
         elif kind in (1, 2) and len(body) == 6:
             half = kind - 1
-            self._axes[3 * half : 3 * half + 3] = self._scaled(body)
+            self._axes[3 * half : 3 * half + 3] = axes = self._scaled(body)
             self._heard_s[half] = now_s
-            moved = True
+            self._pushed[half] = any(axes)
+            # The second half follows the first; two at rest the other way round are of two moments.
+            self._rested = self._rested or (half == 1 and self._pushed == [False, False])
         elif kind == 3 and 1 <= len(body) <= 6:
             bits = int.from_bytes(body, "little")
             self._buttons = frozenset(n for n in range(8 * len(body)) if bits >> n & 1)
-            moved = False
-        elif kind in (0x17, 0x19) and len(body) <= 3:  # battery of the wireless ones
-            moved = False
-        else:
+        elif not (kind in (0x17, 0x19) and len(body) <= 3):  # battery of the wireless ones
             self.malformed += 1
             self._axes = [0.0] * _AXES
-            moved = False
-        if moved and not any(self._axes):
-            self._rested = True
 
     def _scaled(self, body: bytes) -> list[float]:
         """Axes from -1 to 1, without a jump at the rim of the dead zone."""

@@ -6,13 +6,15 @@
     stage.move_to({"x": 1200.0}); stage.wait_until_still()
 
 Opening sends questions only. Everything that could move asks the latch first, then the limits, then sends.
-A velocity is a short way at that speed: a host that falls silent leaves a stage at rest.
+A velocity is a short way at that speed, a long move a train of such ways, each sent while the last one runs:
+a silent host leaves a stage at rest.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
+import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -41,7 +43,17 @@ class Controller(Protocol):
 
     @property
     def stops(self) -> int:
-        """How often `stop` was called."""
+        """How often it was stopped."""
+        ...
+
+    @property
+    def rest_s(self) -> float | None:
+        """None where axes can be sent elsewhere in motion; else how long they settle before they can."""
+        ...
+
+    @property
+    def blind(self) -> bool:
+        """Whether it knows where its axes are at rest only; then it has a `rest_s` too."""
         ...
 
     def travel(self, axes: Collection[str]) -> dict[str, tuple[float, float]]:
@@ -82,6 +94,10 @@ class Controller(Protocol):
         """Bring everything to rest: at once, from any thread, waiting for no reply."""
         ...
 
+    def emergency_stop(self) -> None:
+        """Stop, if need be by switching the drives off; likewise."""
+        ...
+
     def close(self) -> None:
         """Let go of the connection."""
         ...
@@ -99,6 +115,10 @@ class Clock(Protocol):
         """Let time pass."""
         ...
 
+    def repeat(self, action: Callable[[], bool], period_s: float) -> None:
+        """Call `action` every period until it says no; return at once."""
+        ...
+
 
 class MonotonicClock:
     """The machine's own."""
@@ -111,6 +131,25 @@ class MonotonicClock:
     def wait(self, duration_s: float) -> None:
         """Sleep."""
         time.sleep(duration_s)
+
+    def repeat(self, action: Callable[[], bool], period_s: float) -> None:
+        """In a thread, which ends with the program."""
+
+        def run() -> None:
+            time.sleep(period_s)
+            while action():
+                time.sleep(period_s)
+
+        threading.Thread(target=run, name="stage", daemon=True).start()
+
+
+@dataclass
+class _Way:
+    """What is left of a move: its course, how often it had been stopped then, when what was sent is over."""
+
+    course: Course
+    since: int
+    over_s: float
 
 
 @dataclass(frozen=True)
@@ -149,6 +188,14 @@ class Stage:
 
     may_move_on_open = False
     _POLL_S = 0.01
+    _HORIZON_S = 0.25
+    """How far ahead of itself a move is sent: so long it runs on when the program dies."""
+    _RENEW_S = 0.1
+    _PIECE_S = 0.1
+    """Likewise, where one piece has to end before the next is sent."""
+    _PIECE_RENEW_S = 0.01
+    """A renewal waits for that end first."""
+    _PIECE_TIMEOUT_S = 5.0
 
     def __init__(
         self,
@@ -164,6 +211,11 @@ class Stage:
         self._clock = clock or MonotonicClock()
         self._watch = MotionWatch(self.axes)
         self._names = {axis.wire: name for name, axis in self.axes.items()}
+        self._turn = threading.RLock()  # one command at a time; a stop takes no turn
+        self._ways: dict[str, _Way] = {}
+        self._renewing = False
+        self._settled = self._resting = False  # at rest; waiting to be
+        self._failure: DriverError | None = None  # met by a renewal, for the next question to raise
         try:
             if not axes or len(self._names) != len(self.axes):
                 raise RequestError("every axis wants a controller's axis of its own, and one at least")
@@ -200,9 +252,10 @@ class Stage:
 
     @property
     def moving(self) -> bool:
-        """Whether anything moves."""
+        """Whether anything moves, or a move is not at its end."""
         with self._stopped_on_failure():
-            return self._controller.moving()
+            on_the_way = bool(self._live_ways())  # first: the last piece may be sent meanwhile
+            return self._controller.moving() or on_the_way
 
     def homed(self) -> dict[str, bool]:
         """Say which axes know where they are."""
@@ -213,6 +266,8 @@ class Stage:
     def position(self) -> dict[str, float]:
         """Read every axis, and compare with what was commanded.
 
+        Where a controller does not know that in motion (`Controller.blind`), wait for what was sent to end.
+
         Raises
         ------
         FollowingError
@@ -220,10 +275,17 @@ class Stage:
         LinkError, ReplyError
             No answer, or one that makes no sense; likewise.
         """
-        with self._stopped_on_failure():
+        with self._turn, self._stopped_on_failure():
+            if self._controller.blind:
+                self._come_to_rest()
             read = self._controller.positions(list(self._names))
             position = {name: read[axis.wire] * axis.scale for name, axis in self.axes.items()}
-            self._watch.check(self._clock.now_s, position)
+            now_s = self._clock.now_s
+            for name, way in list(self._ways.items()):
+                if now_s > way.over_s:  # it stands since then, for want of a renewal
+                    self._watch.delay(name, now_s - way.over_s)
+                    way.over_s = now_s
+            self._watch.check(now_s, position)
         return position
 
     def state(self) -> StageState:
@@ -241,7 +303,9 @@ class Stage:
         """
         since = self._controller.stops
         self.latch.require()
-        self._controller.enable(list(self._names), since=since)
+        with self._turn:
+            self._rest_before_sending()
+            self._controller.enable(list(self._names), since=since)
 
     def home(
         self, axes: Collection[str] | None = None, *, confirm: bool = False, timeout_s: float = 60.0
@@ -263,7 +327,10 @@ class Stage:
                 f"homing {', '.join(names)} drives to the ends of travel: clear the way, then confirm"
             )
         self.latch.require()
-        self._watch.forget()
+        with self._turn:
+            self._watch.forget()
+            self._ways.clear()
+            self._rest_before_sending()
         self._guarded_home(wires, since, timeout_s)
         missing = [self._names[w] for w, known in self._controller.homed(wires).items() if not known]
         if missing:
@@ -284,7 +351,10 @@ class Stage:
     def move_to(self, targets: Mapping[str, float], *, speed: float | None = None) -> None:
         """Leave for the given positions, each axis at its own fastest speed or at `speed`.
 
-        Returns at once; `wait_until_still` waits. Limits refuse before a byte is sent.
+        Returns at once; `wait_until_still` waits. Limits refuse before a byte is sent. The controller is told
+        no more of the way than takes a quarter of a second; the next piece follows while that one runs, for
+        as long as this program does and hears where the axes are. What goes wrong meanwhile opens the latch
+        at once, and is raised by the next question.
 
         Raises
         ------
@@ -308,18 +378,30 @@ class Stage:
         self.latch.require()
         if not targets:
             return
-        self._require_homed(targets)
-        position = self.position()
-        self._send(
-            {
-                name: Course(
-                    0.0, position[name], target, speed if speed is not None else self.axes[name].speed_limit
+        with self._turn:
+            self._failure = None  # the operator has armed the stage since
+            self._rest_before_sending()
+            self._require_homed(targets)
+            position = self.position()
+            now_s = self._clock.now_s
+            ways = {
+                name: _Way(
+                    Course(
+                        now_s,
+                        position[name],
+                        target,
+                        speed if speed is not None else self.axes[name].speed_limit,
+                    ),
+                    since,
+                    now_s,
                 )
                 for name, target in targets.items()
-            },
-            (),
-            since,
-        )
+            }
+            self._go_on(ways, position, since)
+            self._watch_from(since, {name: way.course for name, way in ways.items()})
+            if self._ways and not self._renewing:
+                self._renewing = True
+                self._clock.repeat(self._renew, self._PIECE_RENEW_S if self._in_pieces else self._RENEW_S)
 
     def set_velocity(self, velocities: Mapping[str, float], *, expires_s: float = 0.25) -> None:
         """Move the named axes at the given velocities for `expires_s`; others go on.
@@ -347,15 +429,25 @@ class Stage:
         self.latch.require()
         if not velocities:
             return
-        self._require_homed(velocities)
-        position = self.position()
-        courses = {}
-        for name, velocity in velocities.items():
-            end = position[name] + velocity * expires_s
-            if velocity != 0:
-                self._limits[name].require(name, end)
-                courses[name] = Course(0.0, position[name], end, abs(velocity))
-        self._send(courses, [name for name, velocity in velocities.items() if velocity == 0], since)
+        with self._turn:
+            self._failure = None
+            if any(velocities.values()):  # to halt, none has to rest
+                self._rest_before_sending()
+            self._require_homed(velocities)
+            position = self.position()
+            now_s = self._clock.now_s
+            courses = {}
+            for name, velocity in velocities.items():
+                end = position[name] + velocity * expires_s
+                if velocity != 0:
+                    self._limits[name].require(name, end)
+                    courses[name] = Course(now_s, position[name], end, abs(velocity))
+            halt = [name for name, velocity in velocities.items() if velocity == 0]
+            self._send({n: (c.target, c.speed) for n, c in courses.items()}, halt, since)
+            for name in velocities:
+                self._ways.pop(name, None)
+            self._watch.leave(halt)
+            self._watch_from(since, courses)
 
     def stop(self) -> None:
         """Bring every axis to rest: at once, from any thread, waiting for no reply; may be called again.
@@ -368,7 +460,13 @@ class Stage:
     def emergency_stop(self, reason: str) -> None:
         """Open the latch and stop; the operator must press anew. Never raises: the latch holds anyway."""
         self.latch.trip(reason)
-        # Where the link is gone nothing more can be said to the device; a velocity expires by itself.
+        self._watch.forget()
+        # Where the link is gone nothing more can be said to the device; what it was sent ends by itself.
+        with contextlib.suppress(DriverError):
+            self._controller.emergency_stop()
+
+    def _trip(self, reason: str) -> None:
+        self.latch.trip(reason)
         with contextlib.suppress(DriverError):
             self.stop()
 
@@ -381,6 +479,8 @@ class Stage:
             Still moving after `timeout_s`; everything is stopped.
         FollowingError
             An axis is stuck or lost; everything is stopped and the latch open.
+        StoppedError
+            The latch was opened by someone else: it stands short of its target.
         """
 
         def moving() -> bool:
@@ -389,13 +489,13 @@ class Stage:
 
         try:
             self._wait_while(moving, timeout_s, "the motion")
-        except ReplyTimeoutError:
+        except (ReplyTimeoutError, KeyboardInterrupt):
             self.stop()
             raise
 
     def close(self) -> None:
         """Stop and let go of the controller; may be called again, never raises over a lost link."""
-        self.emergency_stop("it was closed")
+        self._trip("it was closed")
         self._controller.close()
 
     def __enter__(self) -> Stage:
@@ -409,28 +509,107 @@ class Stage:
     @contextlib.contextmanager
     def _stopped_on_failure(self) -> Iterator[None]:
         """Stop and open the latch where the stage cannot be seen any more, or is not where it should be."""
+        if (failure := self._failure) is not None:
+            self._failure = None
+            raise failure
         try:
             yield
+        except StoppedError:
+            raise
         except (FollowingError, LinkError) as failure:
             self.emergency_stop(str(failure))
             raise
+        except DriverError as failure:
+            self._trip(str(failure))
+            raise
 
-    def _send(self, courses: Mapping[str, Course], halt: Collection[str], since: int) -> None:
-        targets = {self.axes[n].wire: c.target / self.axes[n].scale for n, c in courses.items()}
-        speeds = {self.axes[n].wire: c.speed / abs(self.axes[n].scale) for n, c in courses.items()}
+    def _live_ways(self) -> dict[str, _Way]:
+        """Give the moves under way that no stop has ended."""
+        return {name: way for name, way in self._ways.items() if way.since == self._controller.stops}
+
+    def _renew(self) -> bool:
+        """Send the next pieces of the moves under way; say whether any is left."""
+        with self._turn:
+            if self._resting:  # the same thread waits: nothing may be sent under its eyes
+                return True
+            self._renewing = False
+            since = self._controller.stops
+            self._ways = self._live_ways()
+            try:
+                if self._ways and not self.latch.armed:  # opened by another stage, or a pedal
+                    self.stop()
+                    raise StoppedError(f"the move ended short of its target: {self.latch.fault}")
+                if self._ways:
+                    self._rest_before_sending()
+                    self._go_on(dict(self._ways), self.position(), since)
+            except DriverError as failure:
+                self._ways.clear()
+                if self._controller.stops == since or not self.latch.armed:
+                    self._failure = failure
+            self._renewing = bool(self._ways)
+            return self._renewing
+
+    def _go_on(self, ways: Mapping[str, _Way], position: Mapping[str, float], since: int) -> None:
+        """Send axes on from where they are, no further than they come within the horizon."""
+        horizon_s = self._PIECE_S if self._in_pieces else self._HORIZON_S
         now_s = self._clock.now_s
+        pieces, left = {}, {}
+        for name, way in ways.items():
+            speed, target = way.course.speed, way.course.target
+            distance = target - position[name]
+            reach = max(speed * horizon_s, self.axes[name].resolution)
+            if abs(distance) > reach:
+                left[name] = _Way(way.course, since, now_s + reach / speed)
+            pieces[name] = (
+                position[name] + math.copysign(reach, distance) if name in left else target,
+                speed,
+            )
+        self._send(pieces, (), since)
+        for name in ways:
+            self._ways.pop(name, None)
+        self._ways |= left
+
+    def _send(self, pieces: Mapping[str, tuple[float, float]], halt: Collection[str], since: int) -> None:
+        """Send targets with their speeds, and axes to halt."""
+        targets = {self.axes[n].wire: target / self.axes[n].scale for n, (target, _) in pieces.items()}
+        speeds = {self.axes[n].wire: speed / abs(self.axes[n].scale) for n, (_, speed) in pieces.items()}
+        self._settled = False
         try:
             self._controller.move(targets, speeds, [self.axes[name].wire for name in halt], since=since)
         except StoppedError:
             raise
         except DriverError as failure:
             # What was refused may have been half of it: nothing goes on.
-            self.emergency_stop(str(failure))
+            if isinstance(failure, LinkError):
+                self.emergency_stop(str(failure))
+            else:
+                self._trip(str(failure))
             raise
-        self._watch.leave(halt)
-        self._watch.begin({n: Course(now_s, c.start, c.target, c.speed) for n, c in courses.items()})
+
+    def _watch_from(self, since: int, courses: Mapping[str, Course]) -> None:
+        self._watch.begin(courses)
         if self._controller.stops != since:
             self._watch.forget()
+
+    @property
+    def _in_pieces(self) -> bool:
+        return self._controller.rest_s is not None
+
+    def _rest_before_sending(self) -> None:
+        with self._stopped_on_failure():
+            self._come_to_rest()
+
+    def _come_to_rest(self) -> None:
+        """Where a controller takes nothing new in motion, wait for the end of what was sent."""
+        if (rest_s := self._controller.rest_s) is None or self._settled:
+            return
+        self._resting = True
+        try:
+            self._wait_while(self._controller.moving, self._PIECE_TIMEOUT_S, "what was sent")
+            self._clock.wait(rest_s)
+            self._settled = True
+        finally:
+            self._resting = False
 
     def _wait_while(self, busy: Callable[[], bool], timeout_s: float, what: str) -> None:
         deadline_s = self._clock.now_s + timeout_s

@@ -9,8 +9,16 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
+from adof_drivers.gcode import GcodeController
 from adof_drivers.gcs import GcsController
-from adof_drivers.link import Link, SerialTransport, TcpTransport, Transport, UsbTransport
+from adof_drivers.link import (
+    FtdiTransport,
+    Link,
+    SerialTransport,
+    TcpTransport,
+    Transport,
+    UsbTransport,
+)
 from adof_drivers.picomotor import PicomotorController
 from adof_drivers.rig import Finding, Section, register
 from adof_drivers.safety import StageAxis
@@ -22,6 +30,9 @@ _SLOWEST_READ_S = 1 / 60
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+_USB = r"^[0-9a-fA-F]{4}(:[0-9a-fA-F]{4})?$"
 
 
 class _Axis(BaseModel):
@@ -72,12 +83,13 @@ def _kind(entry: Any) -> str:
 
 
 class StageSection(Section):
-    """A stage: one of `tcp`, `usb`, `serial`, and its axes."""
+    """A stage: one of `tcp`, `usb`, `ftdi`, `serial`, and its axes."""
 
-    ports: ClassVar[Collection[str]] = ("tcp", "usb", "serial")
+    ports: ClassVar[Collection[str]] = ("tcp", "usb", "ftdi", "serial")
 
     tcp: Annotated[str, Field(pattern=r"^[^:]+:\d{1,5}$")] | None = None
-    usb: Annotated[str, Field(pattern=r"^[0-9a-fA-F]{4}(:[0-9a-fA-F]{4})?$")] | None = None
+    usb: Annotated[str, Field(pattern=_USB)] | None = None
+    ftdi: Annotated[str, Field(pattern=_USB)] | None = None
     usb_serial_number: str | None = None
     serial: str | None = None
     baud: Annotated[int, Field(gt=0)] = 115200
@@ -95,7 +107,7 @@ class StageSection(Section):
 
     @model_validator(mode="after")
     def _one_port(self) -> StageSection:
-        given = [port for port in ("tcp", "usb", "serial") if getattr(self, port) is not None]
+        given = [port for port in ("tcp", "usb", "ftdi", "serial") if getattr(self, port) is not None]
         if len(given) != 1 or given[0] not in self.ports:
             raise ValueError(
                 f"{' and '.join(given) or 'no port'} is given: one of {', '.join(self.ports)} was wanted"
@@ -117,11 +129,12 @@ class StageSection(Section):
         if self.tcp is not None:
             host, _, port = self.tcp.rpartition(":")
             return TcpTransport(host, int(port), timeout_s=max(self.timeout_s, 1.0))
-        if self.usb is not None:
-            vendor, _, product = self.usb.partition(":")
-            return UsbTransport(
-                int(vendor, 16), int(product, 16) if product else None, serial_number=self.usb_serial_number
-            )
+        if (identity := self.usb or self.ftdi) is not None:
+            vendor, _, product = identity.partition(":")
+            ids = int(vendor, 16), int(product, 16) if product else None
+            if self.usb is not None:
+                return UsbTransport(*ids, serial_number=self.usb_serial_number)
+            return FtdiTransport(*ids, baud=self.baud, serial_number=self.usb_serial_number)
         assert self.serial is not None
         return SerialTransport(self.serial, baud=self.baud)
 
@@ -213,3 +226,14 @@ class PicomotorSection(StageSection):
     def controller(self, link: Link) -> Controller:
         """Steps."""
         return PicomotorController(link)
+
+
+@register("stage", "gcode")
+class GcodeSection(StageSection):
+    """A MicroManipulatorStepper; units are mm, axes X, Y and Z. They state low and high."""
+
+    ports: ClassVar[Collection[str]] = ("serial", "tcp")
+
+    def controller(self, link: Link) -> Controller:
+        """G-code."""
+        return GcodeController(link)

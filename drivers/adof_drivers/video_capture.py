@@ -43,6 +43,10 @@ class VideoCaptureCamera:
         self._live = isinstance(source, int)
         self._rate_hz = rate_hz
         self._thread: threading.Thread | None = None
+        # OpenCV's capture belongs to one thread at a time: to let go of it during a read crashes.
+        self._turn = threading.Lock()
+        self._reading = False
+        self._closed = False
         self._stopping = threading.Event()
         self._frames: queue.Queue[Frame | None] = queue.Queue(_KEPT)
         self._capture = self._open()
@@ -66,18 +70,37 @@ class VideoCaptureCamera:
         return self._shape
 
     def start(self) -> None:
-        """Begin to acquire; a file begins anew."""
+        """Begin to acquire; a file begins anew.
+
+        Raises
+        ------
+        DeviceLostError
+            It is closed, or the last read still waits for a frame.
+        """
         if self._thread is not None:
             return
+        with self._turn:
+            if self._closed or self._reading:
+                raise DeviceLostError(f"{self._source!r} is closed, or sends nothing: open it again")
         if not self._live:
             self._capture.release()
             self._capture = self._open()
         self._stopping.clear()
         self._frames = queue.Queue(_KEPT)
+        self._reading = True
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 
     def _read(self) -> None:
+        try:
+            self._read_frames()
+        finally:
+            with self._turn:
+                self._reading = False
+                if self._closed:
+                    self._capture.release()
+
+    def _read_frames(self) -> None:
         number = 0
         while not self._stopping.is_set():
             read, pixels = self._capture.read()
@@ -127,9 +150,12 @@ class VideoCaptureCamera:
             self._thread = None
 
     def close(self) -> None:
-        """Give the camera back."""
+        """Give the camera back, once OpenCV has done with it: at once, or when the read under way ends."""
         self.stop()
-        self._capture.release()
+        with self._turn:
+            self._closed = True
+            if not self._reading:
+                self._capture.release()
 
 
 def _grey(pixels: NDArray[Any]) -> NDArray[Any]:

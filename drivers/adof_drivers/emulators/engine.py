@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,6 +36,8 @@ class Engine(ABC):
         What goes wrong from now on.
     received
         Lines and single bytes, in order.
+    silent_until_s
+        What is asked before that is answered then.
     """
 
     singles: bytes = b""
@@ -46,6 +49,7 @@ class Engine(ABC):
         self.motors: dict[str, Motor] = {}
         self.faults = faults or FaultSchedule()
         self.received: list[bytes] = []
+        self.silent_until_s = -math.inf
         self._now_s = now_s
         self._buffer = b""
 
@@ -132,4 +136,5 @@ class Engine(ABC):
         data = self._answer(line)
         if garbled:
             data = bytes(byte ^ 0x15 if byte != 10 else byte for byte in data)
+        delay_s += max(0.0, self.silent_until_s - self._now_s())
         return Reply(b"" if lost else data, delay_s)

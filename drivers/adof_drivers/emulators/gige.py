@@ -34,6 +34,7 @@ from adof_drivers.emulators.gige_features import (
     OFFSET_Y,
     PAYLOAD_SIZE,
     PIXEL_FORMAT,
+    PIXEL_FORMATS,
     SENSOR_HEIGHT,
     SENSOR_WIDTH,
     START,
@@ -47,7 +48,6 @@ from adof_drivers.emulators.gige_features import (
 from adof_drivers.errors import DriverError
 
 PORT = 3956
-MONO8, MONO16 = 0x01080001, 0x01100007
 
 _DISCOVERY, _RESEND, _READ_REGISTER, _WRITE_REGISTER, _READ_MEMORY, _WRITE_MEMORY = (
     0x02,
@@ -118,6 +118,9 @@ class Faults:
         Share of frames of which nothing is sent, though they are counted.
     swapped
         Share of frames sent after the one that follows them.
+    garbled
+        Share of packets, replies and frames' alike, that are malformed: cut, lengthened, their fields
+        changed; pixels are not, for nothing could tell.
     delay_s
         Frames are late by up to this.
     freeze_at, stall_at, disconnect_at
@@ -128,13 +131,14 @@ class Faults:
     packet_loss: float = 0.0
     frame_loss: float = 0.0
     swapped: float = 0.0
+    garbled: float = 0.0
     delay_s: float = 0.0
     freeze_at: int | None = None
     stall_at: int | None = None
     disconnect_at: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("packet_loss", "frame_loss", "swapped"):
+        for name in ("packet_loss", "frame_loss", "swapped", "garbled"):
             share = getattr(self, name)
             if not 0 <= share <= 1:
                 raise DriverError(f"{name} is {share}: a share from 0 to 1 was wanted")
@@ -146,8 +150,71 @@ class Faults:
         return np.random.default_rng([self.seed, number])
 
 
+def _garble(packet: bytes, fields: int, draw: np.random.Generator) -> bytes:
+    """Cut a packet, lengthen it, or change some of its first `fields` bytes."""
+    kind = draw.integers(4)
+    if kind == 0:
+        return packet[: int(draw.integers(len(packet)))]
+    if kind == 1:
+        return packet + draw.bytes(int(draw.integers(1, 64)))
+    changed = bytearray(packet)
+    for place in draw.integers(min(fields, len(packet)), size=int(draw.integers(1, 5))):
+        changed[place] = draw.integers(256)
+    return bytes(changed)
+
+
 def _reached(limit: int | None, number: int) -> bool:
     return limit is not None and number >= limit
+
+
+class TriggerLine:
+    """One wire that triggers several cameras: at each pulse all of them expose, so that they keep step.
+
+    While one is still busy with its last exposure the pulse waits, for whole periods of the cameras' rate.
+    """
+
+    def __init__(self) -> None:
+        self._condition = threading.Condition()
+        self._seen: dict[object, int] = {}  # by camera, the last pulse it exposed at
+        self._ready: set[object] = set()
+        self._period_s = 0.0
+        self._pulses = 0
+        self.moment_s = 0.0
+
+    def leave(self, camera: object) -> None:
+        """Wait for this camera no longer: it does not acquire."""
+        with self._condition:
+            self._seen.pop(camera, None)
+            self._ready.discard(camera)
+            self._pulse()
+
+    def wait(self, camera: object, period_s: float, timeout_s: float) -> float | None:
+        """Be ready for a pulse; return its moment, which may lie ahead, or None after the time-out."""
+        with self._condition:
+            seen = self._seen.setdefault(camera, self._pulses)
+            if seen == self._pulses:
+                self._period_s = period_s
+                self._ready.add(camera)
+                self._pulse()
+            if not self._condition.wait_for(lambda: self._pulses != seen, timeout_s):
+                return None
+            self._seen[camera] = self._pulses
+            return self.moment_s
+
+    def _pulse(self) -> None:
+        if self._ready and self._ready == self._seen.keys():
+            self.moment_s = _next_moment_s(self.moment_s, self._period_s)
+            self._ready.clear()
+            self._pulses += 1
+            self._condition.notify_all()
+
+
+def _next_moment_s(last_s: float, period_s: float) -> float:
+    """When to expose next: free-running cameras of one rate keep step, as if one clock triggered them.
+
+    A moment may begin late by up to a period; later ones are not made up for.
+    """
+    return period_s * max(round(last_s / period_s) + 1, math.floor(time.monotonic() / period_s))
 
 
 @dataclass(frozen=True)
@@ -164,19 +231,24 @@ class GigeCameraEmulator:
     Parameters
     ----------
     source
-        Makes the pictures; uint8 becomes Mono8, uint16 Mono16.
+        Makes the pictures: uint8 for Mono8, uint16 for all else.
     sensor
         Rows and columns.
     address
         Where it listens; each camera needs one of its own. Keep to 127.0.0.0/8 unless others shall see it.
     siblings
         Addresses of other emulators that this one names when asked who is there: clients ask 127.0.0.1 alone.
+    pixel_format
+        One of `gige_features.PIXEL_FORMATS`; pixels of packed ones follow each other bit for bit, over the
+        ends of lines.
     rate_hz, exposure_us
         As switched on; clients may change them.
     line_padding
         Bytes after each line, as cameras send that align their lines.
     faults
         What goes wrong.
+    line
+        Triggers it instead of its own clock; the rate is still its own.
 
     Attributes
     ----------
@@ -186,7 +258,8 @@ class GigeCameraEmulator:
     Raises
     ------
     DriverError
-        The address cannot be had, or a picture of another size or type than promised.
+        The address cannot be had, an unknown pixel format, line padding with a packed one, or a picture of
+        another size, type or depth than promised.
     """
 
     def __init__(
@@ -196,25 +269,36 @@ class GigeCameraEmulator:
         *,
         address: str = "127.0.0.1",
         siblings: Sequence[str] = (),
-        sixteen_bit: bool = False,
+        pixel_format: str = "Mono8",
         rate_hz: float = 60.0,
         exposure_us: float = 5000.0,
         line_padding: int = 0,
         faults: Faults | None = None,
+        line: TriggerLine | None = None,
     ) -> None:
         if not 0 < rate_hz < math.inf:
             raise DriverError(f"rate_hz is {rate_hz}: a rate above 0 was wanted")
         if min(sensor) < 1:
             raise DriverError(f"sensor is {sensor}: (rows, columns) of 1 or more were wanted")
+        if pixel_format not in PIXEL_FORMATS:
+            raise DriverError(
+                f"pixel_format is '{pixel_format}': one of {', '.join(PIXEL_FORMATS)} was wanted"
+            )
+        code, self._depth = PIXEL_FORMATS[pixel_format]
+        self._bits = code >> 16 & 0xFF
+        if line_padding and self._bits % 8:
+            raise DriverError(f"line_padding is {line_padding}: lines of {pixel_format} do not end on a byte")
         self._source = source
-        self._dtype = np.dtype(np.uint16 if sixteen_bit else np.uint8)
+        self._pixel_format = pixel_format
+        self._dtype = np.dtype(np.uint8 if self._depth == 8 else np.uint16)
         self.address = address
         self.sent = 0
         self.resent = 0
         self.failure: BaseException | None = None
         self._siblings = tuple(siblings)
         self._faults = faults or Faults()
-        self._memory = _memory(address, sensor, self._dtype, rate_hz, exposure_us, line_padding)
+        self._line = line
+        self._memory = _memory(address, sensor, pixel_format, rate_hz, exposure_us, line_padding)
         self._controller: tuple[str, int] | None = None
         self._heard_s = 0.0
         self._acquiring = threading.Event()
@@ -223,6 +307,7 @@ class GigeCameraEmulator:
         self._kept: OrderedDict[int, _Block] = OrderedDict()
         self._kept_lock = threading.Lock()
         self._exposures = 0
+        self._replies = self._faults.draw(-1 % (1 << 32))
         self._lost = False
         self._threads: list[threading.Thread] = []
         self._control = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -310,7 +395,7 @@ class GigeCameraEmulator:
         if command == _DISCOVERY:
             for address in (self.address, *self._siblings):
                 identity = bytes(_identity(address))
-                self._control.sendto(struct.pack(">HHHH", 0, 3, len(identity), request) + identity, peer)
+                self._reply(struct.pack(">HHHH", 0, 3, len(identity), request) + identity, peer)
             return
         if peer == self._controller:
             self._heard_s = time.monotonic()
@@ -325,7 +410,12 @@ class GigeCameraEmulator:
         }.get(command)
         status, reply = handler(body, peer) if handler else (_NOT_IMPLEMENTED, b"")
         if answer:
-            self._control.sendto(struct.pack(">HHHH", status, command + 1, len(reply), request) + reply, peer)
+            self._reply(struct.pack(">HHHH", status, command + 1, len(reply), request) + reply, peer)
+
+    def _reply(self, packet: bytes, peer: tuple[str, int]) -> None:
+        if self._replies.random() < self._faults.garbled:
+            packet = _garble(packet, 8, self._replies)
+        self._control.sendto(packet, peer)
 
     def _read_registers(self, body: bytes, _peer: tuple[str, int]) -> tuple[int, bytes]:
         reply = b""
@@ -427,8 +517,8 @@ class GigeCameraEmulator:
         if self._acquiring.is_set():
             return _ACCESS_DENIED
         self._set(address, value)
-        line = wanted[WIDTH] * self._dtype.itemsize + self._get(LINE_PADDING)
-        self._set(PAYLOAD_SIZE, line * wanted[HEIGHT])
+        shape = (wanted[HEIGHT], wanted[WIDTH])
+        self._set(PAYLOAD_SIZE, _payload_bytes(shape, self._bits, self._get(LINE_PADDING)))
         return 0
 
     def _release(self) -> None:
@@ -456,6 +546,8 @@ class GigeCameraEmulator:
         while not self._closing.is_set():
             if not self._acquiring.is_set():
                 block, held, begun_s = 0, None, time.monotonic()
+                if self._line is not None:
+                    self._line.leave(self)
                 self._acquiring.wait(0.05)
                 continue
             if self._get(TRIGGER_MODE):
@@ -463,7 +555,14 @@ class GigeCameraEmulator:
                     continue
                 begun_s = time.monotonic()
             else:
-                begun_s = self._next_moment_s(begun_s)
+                period_s = 1 / self._get_float(FRAME_RATE_HZ)
+                if self._line is None:
+                    begun_s = _next_moment_s(begun_s, period_s)
+                else:
+                    moment_s = self._line.wait(self, period_s, 0.05)
+                    if moment_s is None:
+                        continue
+                    begun_s = moment_s
                 left_s = begun_s - time.monotonic()
                 if left_s > 0 and self._closing.wait(left_s):
                     return
@@ -498,14 +597,6 @@ class GigeCameraEmulator:
                     self._transmit(one, draw)
             held = None
 
-    def _next_moment_s(self, last_s: float) -> float:
-        """When to expose next: free-running cameras of one rate keep step, as if one clock triggered them.
-
-        A moment may begin late by up to a period; later ones are not made up for.
-        """
-        period_s = 1 / self._get_float(FRAME_RATE_HZ)
-        return period_s * max(round(last_s / period_s) + 1, math.floor(time.monotonic() / period_s))
-
     def _expose(self, number: int) -> NDArray[Any]:
         shape = (self._get(HEIGHT), self._get(WIDTH))
         pixels = self._source(number, ((self._get(OFFSET_Y), self._get(OFFSET_X)), shape))
@@ -513,15 +604,14 @@ class GigeCameraEmulator:
             raise DriverError(
                 f"exposure {number} is {pixels.shape} {pixels.dtype}: {shape} {self._dtype} was wanted"
             )
+        if int(pixels.max()) >> self._depth:
+            raise DriverError(f"exposure {number} has a {pixels.max()}: {self._depth} bits were wanted")
         return pixels
 
     def _cut(self, block: int, pixels: NDArray[Any], ticks: int) -> _Block:
         rows, columns = pixels.shape
         padding = self._get(LINE_PADDING)
-        lines = np.zeros((rows, columns * self._dtype.itemsize + padding), np.uint8)
-        little = np.ascontiguousarray(pixels, dtype=self._dtype.newbyteorder("<"))
-        lines[:, : columns * self._dtype.itemsize] = little.view(np.uint8)
-        data = lines.tobytes()
+        data = self._packed(pixels) if self._bits % 8 else self._lines(pixels, padding)
         leader = struct.pack(
             ">HHIIIIIIIHH",
             0,
@@ -548,11 +638,32 @@ class GigeCameraEmulator:
             ),
         )
 
+    def _lines(self, pixels: NDArray[Any], padding: int) -> bytes:
+        rows, columns = pixels.shape
+        lines = np.zeros((rows, columns * self._dtype.itemsize + padding), np.uint8)
+        little = np.ascontiguousarray(pixels, dtype=self._dtype.newbyteorder("<"))
+        lines[:, : columns * self._dtype.itemsize] = little.view(np.uint8)
+        return lines.tobytes()
+
+    def _packed(self, pixels: NDArray[Any]) -> bytes:
+        """Low bits first; in the older Mono12Packed the byte between two pixels has both low halves."""
+        flat = pixels.ravel()
+        if self._pixel_format == "Mono12Packed":
+            pairs = np.resize(flat, (flat.size + 1) // 2 * 2).reshape(-1, 2)
+            first, second = pairs[:, 0], pairs[:, 1]
+            triples = np.stack([first >> 4, first & 15 | (second & 15) << 4, second >> 4], axis=1)
+            return triples.astype(np.uint8).tobytes()[: -(-flat.size * self._bits // 8)]
+        bits = flat[:, None] >> np.arange(self._depth, dtype=np.uint16) & 1
+        return np.packbits(bits.astype(np.uint8), bitorder="little").tobytes()
+
     def _transmit(self, block: _Block, draw: np.random.Generator) -> None:
         lost = draw.random(len(block.packets)) < self._faults.packet_loss
+        garbled = draw.random(len(block.packets)) < self._faults.garbled
+        last = len(block.packets) - 1
         for index, packet in enumerate(block.packets):
-            if not (lost[index] and 0 < index < len(block.packets) - 1):
-                self._send(packet)
+            if lost[index] and 0 < index < last:
+                continue
+            self._send(_garble(packet, 8 if 0 < index < last else 48, draw) if garbled[index] else packet)
         self.sent += 1
 
     def _resend(self, body: bytes) -> None:
@@ -588,10 +699,15 @@ def _identity(address: str) -> bytearray:
     return memory
 
 
+def _payload_bytes(shape: tuple[int, int], bits: int, padding: int) -> int:
+    rows, columns = shape
+    return -(-rows * columns * bits // 8) + rows * padding
+
+
 def _memory(
     address: str,
     sensor: tuple[int, int],
-    dtype: np.dtype[Any],
+    pixel_format: str,
     rate_hz: float,
     exposure_us: float,
     line_padding: int,
@@ -601,7 +717,8 @@ def _memory(
     identity = _identity(address)
     memory[: len(identity)] = identity
     rows, columns = sensor
-    xml = description(sixteen_bit=dtype.itemsize == 2).encode()
+    xml = description(pixel_format).encode()
+    code = PIXEL_FORMATS[pixel_format][0]
     memory[XML_ADDRESS : XML_ADDRESS + len(xml)] = xml
     url = f"Local:adof.xml;{XML_ADDRESS:x};{len(xml):x}".encode()
     memory[0x200 : 0x200 + len(url)] = url
@@ -617,9 +734,9 @@ def _memory(
         (SENSOR_HEIGHT, rows),
         (WIDTH, columns),
         (HEIGHT, rows),
-        (PIXEL_FORMAT, MONO16 if dtype.itemsize == 2 else MONO8),
+        (PIXEL_FORMAT, code),
         (LINE_PADDING, line_padding),
-        (PAYLOAD_SIZE, rows * (columns * dtype.itemsize + line_padding)),
+        (PAYLOAD_SIZE, _payload_bytes(sensor, code >> 16 & 0xFF, line_padding)),
     ):
         struct.pack_into(">I", memory, register, value)
     struct.pack_into(">f", memory, EXPOSURE_US, exposure_us)

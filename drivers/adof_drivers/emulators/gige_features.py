@@ -8,6 +8,17 @@ PIXEL_FORMAT, PAYLOAD_SIZE, SENSOR_WIDTH, SENSOR_HEIGHT = 0x10010, 0x10014, 0x10
 START, STOP, TRIGGER_MODE, TRIGGER_SOFTWARE = 0x10020, 0x10024, 0x10028, 0x1002C
 EXPOSURE_US, FRAME_RATE_HZ, LINE_PADDING = 0x10030, 0x10034, 0x10038
 
+PIXEL_FORMATS = {
+    "Mono8": (0x01080001, 8),
+    "Mono10": (0x01100003, 10),
+    "Mono12": (0x01100005, 12),
+    "Mono16": (0x01100007, 16),
+    "Mono10p": (0x010A0046, 10),
+    "Mono12p": (0x010C0047, 12),
+    "Mono12Packed": (0x010C0006, 12),
+}
+"""By name in the Pixel Format Naming Convention: the code, and how many bits are pixel."""
+
 
 def _register(name: str, address: int, access: str = "RO") -> str:
     return (
@@ -62,9 +73,8 @@ def _text(name: str, address: int, length: int) -> str:
     )
 
 
-def description(*, sixteen_bit: bool) -> str:
+def description(pixel_format: str) -> str:
     """Return the XML; names as in the Standard Features Naming Convention."""
-    pixel_format = {"Mono16": 0x01100007} if sixteen_bit else {"Mono8": 0x01080001}
     features = {
         "DeviceVendorName": _text("DeviceVendorName", 0x48, 32),
         "DeviceModelName": _text("DeviceModelName", 0x68, 32),
@@ -76,7 +86,7 @@ def description(*, sixteen_bit: bool) -> str:
         "Height": _integer("Height", HEIGHT, "RW", "<Min>1</Min><pMax>SensorHeight</pMax>"),
         "OffsetX": _integer("OffsetX", OFFSET_X, "RW", "<Min>0</Min><pMax>SensorWidth</pMax>"),
         "OffsetY": _integer("OffsetY", OFFSET_Y, "RW", "<Min>0</Min><pMax>SensorHeight</pMax>"),
-        "PixelFormat": _choice("PixelFormat", pixel_format, PIXEL_FORMAT),
+        "PixelFormat": _choice("PixelFormat", {pixel_format: PIXEL_FORMATS[pixel_format][0]}, PIXEL_FORMAT),
         "PayloadSize": _integer("PayloadSize", PAYLOAD_SIZE),
         "ExposureTime": _float("ExposureTime", EXPOSURE_US, "us", 1, 1e7),
         "AcquisitionFrameRate": _float("AcquisitionFrameRate", FRAME_RATE_HZ, "Hz", 0.1, 1000),

@@ -12,7 +12,8 @@ from adof_drivers.emulators.motion import Motor
 _AXES = ("1", "2", "3", "4")
 _FARTHEST = 2**31 - 1
 _MEANINGS = {0: "NO ERROR DETECTED", 6: "COMMAND DOES NOT EXIST", 7: "PARAMETER OUT OF RANGE",
-             9: "AXIS NUMBER OUT OF RANGE", 38: "COMMAND PARAMETER MISSING"}  # fmt: skip
+             9: "AXIS NUMBER OUT OF RANGE", 14: "MOTION IN PROGRESS",
+             38: "COMMAND PARAMETER MISSING"}  # fmt: skip
 # "0>" or "1>" before a command addresses this controller in a chain.
 _LINE = re.compile(r"(?:[01]>)?(\d*)([A-Z]{2})(\?|[+-]?\d*|[+-])")
 
@@ -63,7 +64,7 @@ class PicomotorEngine(Engine):
             return f"{self._errors.pop() if self._errors else 0}\r\n".encode()
         if command == "TB" and argument == "?":
             code = self._errors.pop() if self._errors else 0
-            return f"{code}, {_MEANINGS.get(code, 'SEE THE MANUAL')}\r\n".encode()
+            return f"{code}, {_MEANINGS.get(code % 100, 'SEE THE MANUAL')}\r\n".encode()
         if command in ("AB", "ST") and not axis:
             for motor in self.motors.values():
                 motor.place(motor.position) if command == "AB" else motor.halt()
@@ -71,7 +72,7 @@ class PicomotorEngine(Engine):
         if axis not in self.motors:
             return self._refuse(9)
         motor = self.motors[axis]
-        return self._ask(command, motor) if argument == "?" else self._act(command, argument, motor)
+        return self._ask(command, motor) if argument == "?" else self._act(command, argument, axis)
 
     def _ask(self, command: str, motor: Motor) -> bytes:
         answers = {
@@ -85,7 +86,8 @@ class PicomotorEngine(Engine):
         }
         return f"{answers[command]}\r\n".encode() if command in answers else self._refuse(6)
 
-    def _act(self, command: str, argument: str, motor: Motor) -> bytes:
+    def _act(self, command: str, argument: str, axis: str) -> bytes:
+        motor = self.motors[axis]
         if command == "ST":
             motor.halt()
             return b""
@@ -100,6 +102,8 @@ class PicomotorEngine(Engine):
         low, high = {"VA": (1, 2000), "AC": (1, 200000)}.get(command, (-_FARTHEST, _FARTHEST))
         if not low <= value <= high:
             return self._refuse(7)
+        if motor.moving:  # a controller may be more lenient; a client must not count on it
+            return self._refuse(100 * int(axis) + 14)
         match command:
             case "PA":
                 motor.go(float(value))

@@ -1,4 +1,7 @@
-"""A pyusb backend with one emulated device: descriptors, two bulk endpoints, packets, exclusive claim."""
+"""A pyusb backend with one emulated device: descriptors, two bulk endpoints, packets, exclusive claim.
+
+`FtdiBus` has the engine behind an FTDI bridge, as PI's serial controllers are on USB.
+"""
 
 from __future__ import annotations
 
@@ -29,6 +32,9 @@ class UsbBus(usb.backend.IBackend):  # type: ignore[misc]  # pyusb has no types
         Largest packet; longer replies come in pieces.
     """
 
+    release = 0x0100
+    """What the descriptor says of the device's version."""
+
     def __init__(
         self,
         engine: Engine,
@@ -56,7 +62,7 @@ class UsbBus(usb.backend.IBackend):  # type: ignore[misc]  # pyusb has no types
         """Descriptor of the device."""
         return SimpleNamespace(
             bLength=18, bDescriptorType=1, bcdUSB=0x200, bDeviceClass=0, bDeviceSubClass=0, bDeviceProtocol=0,
-            bMaxPacketSize0=64, idVendor=self.identity[0], idProduct=self.identity[1], bcdDevice=0x100,
+            bMaxPacketSize0=64, idVendor=self.identity[0], idProduct=self.identity[1], bcdDevice=self.release,
             iManufacturer=0, iProduct=0, iSerialNumber=0, bNumConfigurations=1, address=1, bus=1,
             port_number=1, port_numbers=(1,), speed=3,
         )  # fmt: skip
@@ -134,7 +140,15 @@ class UsbBus(usb.backend.IBackend):  # type: ignore[misc]  # pyusb has no types
         self, _handle: object, _endpoint: int, _interface: int, buffer: array[int], timeout: int
     ) -> int:
         """Carry one packet from the device, or time out."""
-        deadline_s = time.monotonic() + timeout / 1000
+        piece = self._take(min(len(buffer), self.packet), timeout / 1000)
+        if not piece:
+            raise usb.core.USBTimeoutError("Operation timed out", errno=errno.ETIMEDOUT)
+        buffer[: len(piece)] = array("B", piece)
+        return len(piece)
+
+    def _take(self, size: int, timeout_s: float) -> bytes:
+        """Take what is due of the next reply, b"" when the time is over."""
+        deadline_s = time.monotonic() + timeout_s
         with self._news:
             while True:
                 self._require_plugged()
@@ -142,16 +156,55 @@ class UsbBus(usb.backend.IBackend):  # type: ignore[misc]  # pyusb has no types
                 if self._held and self._held[0][0] <= now_s:
                     break
                 if now_s >= deadline_s:
-                    raise usb.core.USBTimeoutError("Operation timed out", errno=errno.ETIMEDOUT)
+                    return b""
                 self._news.wait(min(self._held[0][0] if self._held else deadline_s, deadline_s) - now_s)
             due_s, data = self._held.popleft()
-            size = min(len(buffer), self.packet)
-            piece, rest = data[:size], data[size:]
-            if rest:
+            if rest := data[size:]:
                 self._held.appendleft((due_s, rest))
-            buffer[: len(piece)] = array("B", piece)
-            return len(piece)
+            return data[:size]
 
     def _require_plugged(self) -> None:
         if not self.plugged:
             raise usb.core.USBError("No such device (it may have been disconnected)", errno=errno.ENODEV)
+
+
+class FtdiBus(UsbBus):
+    """The engine behind an FT232R: modem and line status go before every packet, and come alone when idle.
+
+    Attributes
+    ----------
+    latency_ms
+        How long a packet short of full is kept.
+    baud_divisor
+        As the bridge was told; None before.
+    """
+
+    release = 0x0600
+    _STATUS = b"\x01\x60"
+    """Nothing is wrong, and all was sent."""
+    _SET_BAUD, _SET_LATENCY = 0x03, 0x09
+    _OUT = 0x40
+
+    latency_ms = 16
+    baud_divisor: int | None = None
+
+    def ctrl_transfer(
+        self, _handle: object, kind: int, request: int, value: int, _index: int, data: Any, _timeout: int
+    ) -> int:
+        """Take a setting."""
+        self._require_plugged()
+        if kind != self._OUT:
+            raise usb.core.USBError("Pipe error", errno=errno.EPIPE)
+        if request == self._SET_LATENCY:
+            self.latency_ms = value
+        elif request == self._SET_BAUD:
+            self.baud_divisor = value
+        return len(data)
+
+    def bulk_read(
+        self, _handle: object, _endpoint: int, _interface: int, buffer: array[int], timeout: int
+    ) -> int:
+        """Carry one packet from the bridge: status, and what the device has sent."""
+        piece = self._STATUS + self._take(self.packet - 2, min(timeout, self.latency_ms) / 1000)
+        buffer[: len(piece)] = array("B", piece)
+        return len(piece)
