@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from adof_cl.autofocus import focus_sweep
 from adof_cl.device import Device
 from adof_cl.errors import AdofError, InputError, TrackingError
-from adof_cl.mask import ModelCalibration, PaperCalibration, choose_mask
+from adof_cl.mask import ModelCalibration, PaperCalibration, choose_mask, depth_margin_um
 from adof_cl.optics import Mask, OpticalSystem, SlmPanel
 from adof_cl.pipeline import Blur, CameraPipeline, WindowedPipeline
 from adof_cl.record import Iteration, Latency, Position, RunRecord
@@ -202,6 +202,8 @@ class Options:
 _DIAGONALS = ((0, 2), (1, 3))
 _GATE_UM = 900.0  # the peg's tip is 300 um under its face: above this depth nothing can touch
 _LOST_LIMIT = 12
+_DEPTH_SIGMAS = 3.0  # of depth that a mask covers beyond the parts: one frame in 400 may lie outside
+_MOST_SIGMA_UM = 100.0  # no mask covers more beyond the whole range
 _TURN_RAD = 0.004  # a template 20 pixels wide turned by this is off by 0.04 at its rim
 _TAUGHT_FRAMES = 4  # a template's noise is a quarter's variance: less than a frame's own
 _INSET_PX = {PEG: 12.0, HOLE: -8.0}  # templates lie on the peg's face, and on the plate around the hole
@@ -237,6 +239,11 @@ class Features:
     def middle_covariance(self) -> Array:
         """Of `middle`."""
         return np.asarray(self.covariance.sum(axis=0) / len(self.covariance) ** 2)
+
+    @property
+    def sigma_px(self) -> float:
+        """Longest half axis of the one-sigma ellipse of the worst feature."""
+        return math.sqrt(max(float(np.linalg.eigvalsh(c)[-1]) for c in self.covariance))
 
     def bent_px(self, taught: Features) -> float:
         """How far the features' distance differs from what was taught: a part is rigid."""
@@ -400,6 +407,8 @@ class Assembly:
         self._features: dict[str, tuple[int, int]] = {}
         self._last_frame_s: dict[int, float] = {}
         self._depth_offset_um, self._frames_fused = 0.0, 0
+        self.depth_sigma_um = 0.0
+        """How well the depth between the parts is known now: what the next mask covers beyond them."""
 
     # ---- the whole run ------------------------------------------------------------------------------------
 
@@ -510,6 +519,7 @@ class Assembly:
 
             found = focus_sweep(picture, low_um, high_um)
             self.world[part] = np.array([0.0, 0.0, found.position])
+            self.depth_sigma_um = math.hypot(self.depth_sigma_um, found.sigma)
             self._tell("autofocus", f"{part} at {found.position:.0f} ± {found.sigma:.0f} µm")
 
     def take_templates(self, part: str, drawings: Sequence[Drawing]) -> None:
@@ -849,8 +859,9 @@ class Assembly:
 
     def _next_mask(self) -> Mask:
         """Choose the mask for where the parts are; a mask that is as good stays, for changing costs time."""
-        peg, hole = float(self.world[PEG][2]), float(self.world[HOLE][2])
-        wanted = self.mask_for(min(peg, hole, 0.0), max(peg, hole))
+        near, far = self._depths()
+        beyond = _DEPTH_SIGMAS * self.depth_sigma_um
+        wanted = self.mask_for(near - beyond, far + beyond)
         eye = self.eyes[0]
         if eye.replanner is not None:
             plan = eye.replanner.plan(*self._to_see(eye))
@@ -860,7 +871,16 @@ class Assembly:
             abs(wanted.alpha_rad - now.alpha_rad) < 0.25
             and abs(wanted.focus_psi_rad - now.focus_psi_rad) < 0.25
         )
+        if close and self.options.mask == "joint" and eye.replanner is None:
+            # Sigma itself scatters: two of three are enough to stay.
+            margin = depth_margin_um(now, eye.optics, near, far, _DEFOCUS_SHARE)
+            close = margin >= beyond * 2 / 3 or wanted == now
         return now if close else wanted
+
+    def _depths(self) -> tuple[float, float]:
+        """Return the nearest and the farthest depth that a mask must cover."""
+        peg, hole = float(self.world[PEG][2]), float(self.world[HOLE][2])
+        return min(peg, hole, 0.0), max(peg, hole)
 
     def _change(self, mask: Mask, codes: Pixels | None) -> None:
         if codes is not None:
@@ -912,7 +932,11 @@ class Assembly:
                 f"features were lost for {_LOST_LIMIT} frames in a row ({reasons[0]}): check light and view, "
                 "then start again"
             )
-        if not blind:
+        if blind:
+            # Nothing was measured: the mask widens until something is.
+            self.depth_sigma_um = min(max(2 * self.depth_sigma_um, 1.0), _MOST_SIGMA_UM)
+        else:
+            self.depth_sigma_um = min(float(fix.sigma_um[2]), _MOST_SIGMA_UM)
             self.world[HOLE] = self.world[PEG] + fix.xyz_um
             self._require_agreement(reading)
         block = self.stereo.camera_1.matrix_px_per_um[:, :2]
@@ -939,6 +963,8 @@ class Assembly:
             ),
             depth_um=float(fix.xyz_um[2]),
             depth_sigma_um=float(fix.sigma_um[2]),
+            hole_sigma_px=hole.sigma_px,
+            peg_sigma_px=peg.sigma_px,
             residual_px=float(fix.residual_px),
             lost=lost_peg + lost_hole,
             usable=not blind,
@@ -960,7 +986,8 @@ class Assembly:
         depths = {part: eye.depth_um(self.world[part]) for part in (PEG, HOLE)}
         speed = abs(float(self._last_move_um[2])) * self.design.frame_rate_hz
         left_um = abs(float(self.world[HOLE][2] - self.world[PEG][2])) - self.options.stand_off_um
-        return eye.replanner.scene(depths, eye.extent_px, speed), max(left_um, 0.0)
+        scene = eye.replanner.scene(depths, eye.extent_px, speed, self.depth_sigma_um)
+        return scene, max(left_um, 0.0)
 
     def _fused_depth_um(self, sight: _Sight) -> float:
         """Return the depth from the z stage, tied to vision by the last frames.
@@ -1013,6 +1040,9 @@ class Assembly:
             stage=stage,
             alpha_rad=mask.alpha_rad,
             focus_psi_rad=mask.focus_psi_rad,
+            depth_margin_um=depth_margin_um(mask, self.design.optics_1, *self._depths(), _DEFOCUS_SHARE),
+            hole_sigma_px=sight.hole_sigma_px,
+            peg_sigma_px=sight.peg_sigma_px,
             hole_depth_um=sight.depth_um,
             hole_depth_sigma_um=sight.depth_sigma_um,
             error_x_um=float(sight.error_um[0]),
@@ -1082,6 +1112,8 @@ class _Sight:
     error_rad: float
     depth_um: float
     depth_sigma_um: float
+    hole_sigma_px: float
+    peg_sigma_px: float
     residual_px: float
     lost: int
     usable: bool

@@ -324,6 +324,33 @@ def depth_to_cover_um(near_um: float, far_um: float, optics: OpticalSystem, *, j
         ) from refusal
 
 
+def depth_margin_um(
+    mask: Mask, optics: OpticalSystem, near_um: float, far_um: float, share: float = 0.6
+) -> float:
+    """Return how far beyond a depth range a mask still covers what is there, the nearer end counting.
+
+    Covered is what defocus leaves `1 - share` of the band of, |psi| at most 3 |alpha| share (docs/maths.md,
+    eq. O6). Negative: how far the range lies beyond what is covered. Without a cubic mask nothing is.
+
+    Raises
+    ------
+    InputError
+        Not finite, near beyond far, or a share outside 0 to 1.
+    """
+    require_finite(near_um=near_um, far_um=far_um)
+    if near_um > far_um:
+        raise InputError(f"near_um is {near_um}, far_um is {far_um}: near must not exceed far")
+    if not 0 <= share <= 1:
+        raise InputError(f"share is {share}: 0 to 1 was wanted")
+    reach = 3 * abs(mask.alpha_rad) * share
+    nearest = optics.depth_um(-reach - mask.focus_psi_rad)
+    try:
+        farthest = optics.depth_um(reach - mask.focus_psi_rad)
+    except InputError:  # no depth defocuses as much
+        farthest = math.inf
+    return min(farthest - far_um, near_um - nearest)
+
+
 @dataclass(frozen=True)
 class FilterQuality:
     """What a Wiener filter for one blur does to noise and to detail.

@@ -60,6 +60,10 @@ class Iteration:
         "coarse", "fine" or "insert".
     alpha_rad, focus_psi_rad
         The mask the frame was taken through.
+    depth_margin_um
+        How far beyond the parts' depths that mask covers.
+    hole_sigma_px, peg_sigma_px
+        Longest half axis of the one-sigma ellipse of the worst feature seen by camera 1.
     hole_depth_um, hole_depth_sigma_um
         Estimated depth of the hole below the peg's focus plane, and its standard deviation.
     error_x_um, error_y_um, error_theta_rad, error_z_um
@@ -79,6 +83,9 @@ class Iteration:
     stage: str
     alpha_rad: float
     focus_psi_rad: float
+    depth_margin_um: float
+    hole_sigma_px: float
+    peg_sigma_px: float
     hole_depth_um: float
     hole_depth_sigma_um: float
     error_x_um: float
@@ -175,6 +182,7 @@ class RunRecord:
             "iterations": len(self.iterations),
             "compute_ms": {k: float(np.percentile(times, q)) if times else None for k, q in quantile.items()},
             **({"latency_ms": latency, "rig": self.rig} if self.real_time else {}),
+            "error_bars": self._error_bars(),
             "lost_features": sum(i.lost_features for i in self.iterations),
             "positions": [p.as_dict() for p in self.positions],
             "device": self.device,
@@ -182,6 +190,27 @@ class RunRecord:
             "run_time_s": self.wall_s,
             "notes": self.notes,
         }
+
+    def _error_bars(self) -> dict[str, dict[str, float | None]]:
+        """Return how large the stated errors were: medians, and the 99th of a hundred; margins: the least."""
+        stated = {
+            "hole_sigma_px": [i.hole_sigma_px for i in self.iterations],
+            "peg_sigma_px": [i.peg_sigma_px for i in self.iterations],
+            "depth_sigma_um": [i.hole_depth_sigma_um for i in self.iterations],
+        }
+        bars: dict[str, dict[str, float | None]] = {}
+        for name, values in stated.items():
+            finite = [value for value in values if math.isfinite(value)]
+            bars[name] = {
+                key: float(np.percentile(finite, q)) if finite else None
+                for key, q in (("p50", 50), ("p99", 99))
+            }
+        margins = [i.depth_margin_um for i in self.iterations]
+        bars["mask_margin_um"] = {
+            "p50": float(np.median(margins)) if margins else None,
+            "least": min(margins) if margins else None,
+        }
+        return bars
 
 
 def finite_json(value: Any) -> Any:

@@ -14,7 +14,7 @@ from adof_cl.profile import TEMPLATE_PX, WINDOWS, Chain
 from adof_cl.scene import Scene, SceneObject
 
 _PLACE_SIGMA_PX = 2.5  # of a part whose stage moves while it is looked at
-_DEPTH_SIGMA_UM = 5.0  # of autofocus, and of depth from two frames
+_DEPTH_SIGMA_UM = 5.0  # of autofocus, and of depth from two frames; where that is worse, it is stated
 _SEARCHES_PX = (48, 64)
 
 
@@ -87,15 +87,19 @@ class Replanner:
         self._safe = replace(usual, restoration=self._restoration, window_px=0, search_px=_SEARCHES_PX[-1])
 
     def scene(
-        self, depth_um: Mapping[str, float], extent_px: Mapping[str, float], speed_um_per_s: float
+        self,
+        depth_um: Mapping[str, float],
+        extent_px: Mapping[str, float],
+        speed_um_per_s: float,
+        depth_sigma_um: float = 0.0,
     ) -> Scene:
-        """Return what is to be seen: parts at depths, of which the last moves."""
+        """Return what is to be seen: parts at depths, known to so much or worse, of which the last moves."""
         names = list(depth_um)
         objects = tuple(
             SceneObject(
                 name,
                 depth_um[name],
-                depth_sigma_um=_DEPTH_SIGMA_UM,
+                depth_sigma_um=max(_DEPTH_SIGMA_UM, depth_sigma_um),
                 extent_px=extent_px[name],
                 place_sigma_px=_PLACE_SIGMA_PX,
                 speed_um_per_s=speed_um_per_s if name == names[-1] else 0.0,
@@ -110,8 +114,14 @@ class Replanner:
         While depths have hardly changed, and the mask not at all, the last plan is returned again.
         """
         depths = tuple(thing.depth_um for thing in scene.objects)
+        sigma_um = max(thing.depth_sigma_um for thing in scene.objects)
         known = self._known.get(mask is None)
-        if known is not None and mask in (None, known.mask) and _alike(depths, known.depths_um):
+        if (
+            known is not None
+            and mask in (None, known.mask)
+            and _alike(depths, known.depths_um)
+            and sigma_um <= 1.5 * known.sigma_um
+        ):
             return known.plan
         budget = self._budget
         plan: Plan | None
@@ -125,7 +135,7 @@ class Replanner:
                 plan = self._planner.plan(scene, max_error_um=most_um, mask=mask, explain=False)
         except BudgetError as refusal:
             plan = refusal.nearest if isinstance(refusal.nearest, Plan) else None
-        self._known[mask is None] = _Known(depths, mask, plan)
+        self._known[mask is None] = _Known(depths, sigma_um, mask, plan)
         return plan
 
     def choose(self, plan: Plan | None) -> None:
@@ -145,6 +155,7 @@ class _Known:
     """The last plan, and what it was for."""
 
     depths_um: tuple[float, ...]
+    sigma_um: float
     mask: Mask | None
     plan: Plan | None
 

@@ -12,7 +12,9 @@ import pytest
 
 from adof_cl.device import Device
 from adof_cl.errors import TrackingError
-from adof_cl.loop import POSITIONS, Assembly
+from adof_cl.loop import HOLE, PEG, POSITIONS, Assembly
+from adof_cl.mask import depth_margin_um
+from adof_cl.optics import Mask
 from adof_cl.record import Iteration
 from adof_cl.twin import Frame
 from assemblies import FullRun, Rehearsal, full_run
@@ -260,6 +262,41 @@ def test_a_camera_that_repeats_one_frame_ends_the_run_at_rest_and_without_contac
     assert mended.assembly.record.end_state.startswith("stopped: ")
     assert at_rest(mended)
     assert len(mended.rig.world.contacts) == touched
+
+
+def test_depth_less_well_known_makes_a_stronger_mask_that_covers_three_sigma(mended: Rehearsal) -> None:
+    rng = np.random.default_rng(6)
+
+    assembly, optics = mended.assembly, mended.rig.design.optics_1
+
+    def margin_um(mask: Mask) -> float:
+        ends = [0.0, *(float(assembly.world[part][2]) for part in (PEG, HOLE))]
+        return depth_margin_um(mask, optics, min(ends), max(ends))
+
+    def sigma_um(noise_grey: float) -> float:
+        """Return the depth's sigma with so much more noise in camera 2; the mask covers twice that."""
+
+        def noisy(number: int, frame: Frame) -> Frame:
+            if number == 1:
+                return frame
+            pixels = frame.pixels + rng.normal(0, noise_grey, frame.pixels.shape)
+            return dataclasses.replace(frame, pixels=np.rint(pixels).clip(0, 255).astype(np.uint8))
+
+        from_iteration(mended, 0, noisy)
+        assembly.bring_hole_to(2000.0)
+        assembly.show(assembly._next_mask())
+        for camera in (mended.rig.camera_1, mended.rig.camera_2):
+            vars(camera).pop("grab", None)
+        assert margin_um(assembly.eyes[0].mask) >= 2 * assembly.depth_sigma_um
+        return assembly.depth_sigma_um
+
+    certain, unsure = sigma_um(0.0), sigma_um(6.0)
+    assert unsure > 2 * certain
+    before = assembly.eyes[0].mask
+    assembly.depth_sigma_um = 50.0
+    wider = assembly._next_mask()
+    assert wider.alpha_rad > before.alpha_rad
+    assert margin_um(wider) == pytest.approx(150.0, rel=0.05)  # the ends' defocus is not quite linear
 
 
 def test_a_loop_that_never_rests_gives_up_at_its_limit(ready: Rehearsal) -> None:

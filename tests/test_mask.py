@@ -17,10 +17,11 @@ from adof_cl.mask import (
     ModelCalibration,
     PaperCalibration,
     choose_mask,
+    depth_margin_um,
     depth_to_cover_um,
     filter_quality,
 )
-from adof_cl.optics import OpticalSystem
+from adof_cl.optics import Mask, OpticalSystem
 from adof_cl.restore import Restore
 
 OPTICS = OpticalSystem()
@@ -210,3 +211,37 @@ def test_a_filter_that_cannot_be_is_refused() -> None:
     for wrong in ((math.nan, 0.0, 0.01), (1.0, math.inf, 0.01), (1.0, 0.0, 0.0)):
         with pytest.raises(InputError):
             filter_quality(OPTICS, *wrong)
+
+
+# ---- the depth it covers ----------------------------------------------------------------------------------
+
+
+@given(st.floats(1, 60), st.floats(-80, 20), st.floats(-300, 300), st.floats(0, 3000), st.floats(0.2, 0.9))
+def test_a_margin_ends_where_defocus_has_taken_its_share_of_the_band(
+    alpha: float, focus: float, near: float, deep: float, share: float
+) -> None:
+    mask, far = Mask(alpha, focus), near + deep
+    margin = depth_margin_um(mask, OPTICS, near, far, share)
+
+    def worse(beyond_um: float) -> float:
+        return max(-mask.psi_rad(OPTICS, near - beyond_um), mask.psi_rad(OPTICS, far + beyond_um))
+
+    assert worse(margin) == pytest.approx(3 * alpha * share, rel=1e-9, abs=1e-9)
+    assert worse(margin + 1) > 3 * alpha * share
+
+
+@given(st.floats(0, 3000), st.floats(0, 300))
+def test_a_wider_range_of_depths_leaves_as_much_less_margin(deep: float, wider: float) -> None:
+    mask = Mask(40.0, -50.0)
+    assert depth_margin_um(mask, OPTICS, -wider, deep + wider) == pytest.approx(
+        depth_margin_um(mask, OPTICS, 0.0, deep) - wider, abs=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("near", "far", "share"),
+    [(math.nan, 0, 0.6), (0, math.inf, 0.6), (1, 0, 0.6), (0, 1, 1.1), (0, 1, math.nan)],
+)
+def test_a_margin_of_no_range_or_share_is_refused(near: float, far: float, share: float) -> None:
+    with pytest.raises(InputError):
+        depth_margin_um(Mask(40.0, -50.0), OPTICS, near, far, share)

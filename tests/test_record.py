@@ -23,6 +23,7 @@ def iteration(number: int, *, lost: int = 0, compute_ms: float = 1.0, depth_um: 
     """One as a rig without a twin leaves it: truth unknown."""
     return Iteration(
         number=number, time_s=number / 60, stage="coarse", alpha_rad=30.0, focus_psi_rad=-50.0,
+        depth_margin_um=40.0 - number, hole_sigma_px=0.04, peg_sigma_px=0.03,
         hole_depth_um=depth_um, hole_depth_sigma_um=1.0, error_x_um=1.0, error_y_um=-1.0,
         error_theta_rad=1e-3, error_z_um=100.0, velocity=(1.0, 2.0, 3.0, 0.0), ssd_hole=1.0, ssd_peg=2.0,
         epipolar_residual_px=math.inf, lost_features=lost, compute_ms=compute_ms,
