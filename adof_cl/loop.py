@@ -24,7 +24,13 @@ from numpy.typing import NDArray
 from adof_cl.autofocus import focus_sweep
 from adof_cl.device import Device
 from adof_cl.errors import AdofError, InputError, TrackingError
-from adof_cl.mask import ModelCalibration, PaperCalibration, choose_mask, depth_margin_um
+from adof_cl.mask import (
+    ModelCalibration,
+    PaperCalibration,
+    choose_mask,
+    depth_margin_um,
+    filter_quality,
+)
 from adof_cl.optics import Mask, OpticalSystem, SlmPanel
 from adof_cl.pipeline import Blur, CameraPipeline, WindowedPipeline
 from adof_cl.record import Iteration, Latency, Position, RunRecord
@@ -183,7 +189,7 @@ class Options:
     fixed_alpha_rad: float = 80.0
     stand_off_um: float = 400.0
     seat_um: float = 150.0
-    nsr: float = 0.01
+    nsr: float = 0.003
     iteration_limit: int = 600
     rig_name: str = "rig"
     budget: Budget | None = None
@@ -1079,6 +1085,8 @@ class Assembly:
                 images = eye.pipeline.restored(sight.frame.pixels, blurs)
             bias = np.array(iteration.hole_bias_px) * self.design.optics_1.object_pitch_um
             depth = iteration.true_depth_um
+            blur = eye.blur(self.world[HOLE])
+            quality = filter_quality(eye.optics, blur.alpha_rad, blur.psi_rad, self.options.nsr)
             self.record.positions.append(
                 Position(
                     name=name,
@@ -1089,6 +1097,12 @@ class Assembly:
                     ssd_hole=sight.ssd_hole,
                     ssd_peg=sight.ssd_peg,
                     lateral_bias_um=(float(bias[0]), float(bias[1])),
+                    depth_sigma_um=sight.depth_sigma_um,
+                    hole_sigma_px=sight.hole_sigma_px,
+                    peg_sigma_px=sight.peg_sigma_px,
+                    depth_margin_um=iteration.depth_margin_um,
+                    noise_gain=quality.noise_gain,
+                    resolution_lp_per_mm=quality.resolution_lp_per_mm,
                     raw=sight.frame.pixels,
                     restored_hole=images[HOLE],
                     restored_peg=images[PEG],

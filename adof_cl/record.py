@@ -110,7 +110,15 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Position:
-    """The loop's state where the hole passes one of the paper's depths A to E."""
+    """The loop's state where the hole passes one of the paper's depths A to E, and the errors it states.
+
+    Attributes
+    ----------
+    depth_sigma_um, hole_sigma_px, peg_sigma_px, depth_margin_um
+        As in `Iteration`.
+    noise_gain, resolution_lp_per_mm
+        Of the hole's filter: what it does to noise, and the finest pattern it keeps half of the contrast of.
+    """
 
     name: str
     depth_um: float
@@ -120,6 +128,12 @@ class Position:
     ssd_hole: float
     ssd_peg: float
     lateral_bias_um: tuple[float, float]
+    depth_sigma_um: float = math.nan
+    hole_sigma_px: float = math.nan
+    peg_sigma_px: float = math.nan
+    depth_margin_um: float = math.nan
+    noise_gain: float = math.nan
+    resolution_lp_per_mm: float = math.nan
     raw: Image | None = None
     restored_hole: Image | None = None
     restored_peg: Image | None = None

@@ -1,7 +1,7 @@
 """Does each error bar hold? Ellipses of features and sigmas of depth, against the twin's truth.
 
     python benchmarks/error_bars.py                     2000 draws over 40 specimens
-    python benchmarks/error_bars.py --draws 400 --nsr 0.003 --json error_bars.json
+    python benchmarks/error_bars.py --draws 400 --nsr 0.01 --json error_bars.json
 
 A draw is a pair of frames: parts somewhere else, at other depths, through another mask, with new noise, and
 with templates taken anew, as the loop takes them, at another place and depth. Counted is how often the truth
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adof_cl.device import Device
-from adof_cl.loop import cut_templates, still_picture
+from adof_cl.loop import Options, cut_templates, still_picture
 from adof_cl.mask import ModelCalibration, choose_mask
 from adof_cl.optics import Mask
 from adof_cl.pipeline import CameraPipeline
@@ -222,7 +222,7 @@ def main() -> None:
     )
     parser.add_argument("--draws", type=int, default=2000)
     parser.add_argument("--specimens", type=int, default=40)
-    parser.add_argument("--nsr", type=float, default=0.01)
+    parser.add_argument("--nsr", type=float, default=Options().nsr)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--device")
     arguments = parser.parse_args()

@@ -32,7 +32,9 @@ def iteration(number: int, *, lost: int = 0, compute_ms: float = 1.0, depth_um: 
 
 def position(name: str) -> Position:
     picture = np.full((4, 4), 7, dtype=np.uint8)
-    return Position(name, 4000.0, 3999.0, 30.0, -50.0, 1.0, 2.0, (math.nan, math.nan), picture, picture)
+    return Position(
+        name, 4000.0, 3999.0, 30.0, -50.0, 1.0, 2.0, (math.nan, math.nan), raw=picture, restored_hole=picture
+    )
 
 
 def strict(path: Path) -> Any:
