@@ -1,4 +1,4 @@
-"""Laws of error bars: as often inside as they say, over specimens, depths, masks, both parts and both cameras."""
+"""Laws of error bars: as often inside as they say, over specimens, depths, masks, parts and cameras."""
 
 from __future__ import annotations
 
