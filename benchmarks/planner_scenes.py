@@ -46,6 +46,7 @@ FRAMES = 8
 DRIFTS = 5
 JUDGED = 40
 KEPT = 0.95
+_ASIDE_UM = 4.0  # half a pixel and more
 
 
 @dataclass
@@ -229,8 +230,12 @@ class Shots:
         self._taken: list[Shot] = []
 
     def first(self, count: int) -> list[Shot]:
-        """Return the first so many."""
+        """Return the first so many; parts stand elsewhere among the pixels each time, as in a run."""
         while len(self._taken) < count:
+            aside = self.rng.uniform(-_ASIDE_UM, _ASIDE_UM, (2, 2))
+            hole, peg = aside + np.array([self.drawn.hole_um, self.drawn.peg_um])
+            depth_um = self.drawn.scene.objects[1].depth_um - self.drawn.scene.objects[0].depth_um
+            self.drawn.specimen.place(depth_um, tuple(hole.tolist()), tuple(peg.tolist()))
             exposure = self.drawn.specimen.expose(self.mask)
             self._taken.append(
                 (exposure, expected(self.drawn, exposure, self.rng), misjudged(self.drawn, self.rng))

@@ -312,3 +312,34 @@ def test_a_machine_without_a_virtual_display_is_told_what_to_install(
         main(["run", "--rig", "emulated", "--out", str(tmp_path / "out")])
     assert ended.value.code == 2
     assert "Xvfb: install it" in capsys.readouterr().err
+
+
+@needs_wire
+@pytest.mark.usefixtures("loopback_cameras")
+@pytest.mark.timeout(300)
+def test_another_program_finds_the_whole_emulated_rig_by_its_file(tmp_path: Path) -> None:
+    file = tmp_path / "emulated.toml"
+    check = (*ADOF, "rig", "check", str(file), "--json")
+    done = subprocess.run(
+        (*ADOF, "emulate", "rig", str(file), "--rate-hz", "20", "--", *check),
+        capture_output=True, text=True, check=False, timeout=200,
+    )  # fmt: skip
+    findings = json.loads(done.stdout)
+    who = {f["device"]: f["found"] for f in findings if f["what"] in ("identity", "panel")}
+    assert set(who) == {"camera.1", "camera.2", "slm.LC2002", "stage.coarse", "stage.fine"}
+    assert "Emulated GigE camera" in who["camera.1"]
+    assert "Emulated C-863" in who["stage.fine"]
+    # Nobody homed the axes, and nothing moved; all else but a busy machine's frame rate is well.
+    wrong = {f["what"] for f in findings if not f["good"]}
+    assert {f"axis {name}" for name in ("x", "y", "z", "theta")} <= wrong
+    assert all(what.startswith(("axis", "frame", "losses")) for what in wrong)
+    assert done.returncode == 1  # the program's own
+
+
+def test_a_rig_file_that_cannot_be_written_is_refused_before_anything_is_started(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["emulate", "rig", str(tmp_path / "none" / "rig.toml")])
+    assert ended.value.code == 2
+    assert "no such folder" in capsys.readouterr().err

@@ -6,12 +6,14 @@ import typer
 
 from adof_cl.cli.emulate_camera import camera
 from adof_cl.cli.emulate_hid import hid
+from adof_cl.cli.emulate_rig import rig
 from adof_cl.cli.emulate_stage import stage
 
 emulate = typer.Typer(
     help="Start an emulated device that speaks the real wire format; Ctrl-C ends it.\n\n"
     "Examples: adof emulate camera --twin 0, adof emulate stage --tcp 127.0.0.1:50000, "
-    "adof emulate hid spacemouse --seed 1 -- python my_jog.py",
+    "adof emulate hid spacemouse --seed 1 -- python my_jog.py, "
+    "adof emulate rig emulated.toml -- adof rig check emulated.toml",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -25,3 +27,4 @@ def _group() -> None:
 emulate.command("camera")(camera)
 emulate.command("stage")(stage)
 emulate.command("hid")(hid)
+emulate.command("rig")(rig)

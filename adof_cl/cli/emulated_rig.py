@@ -373,8 +373,10 @@ class EmulatedRig:
 
 
 @contextmanager
-def emulated(seed: int, *, rate_hz: float) -> Iterator[EmulatedRig]:
+def emulated(seed: int, *, rate_hz: float, operators: bool = True) -> Iterator[EmulatedRig]:
     """Run the twin of a seed behind its protocols; DISPLAY is the panel's meanwhile.
+
+    With `operators` its file names the devices that `Hands` hold.
 
     Raises
     ------
@@ -399,7 +401,8 @@ def emulated(seed: int, *, rate_hz: float) -> Iterator[EmulatedRig]:
         if isinstance(answer, Exception):
             raise answer
         os.environ["DISPLAY"], ports = answer
-        yield EmulatedRig(rig_text(Design(), ports, rate_hz), RemoteWorld(here), Hands())
+        text = rig_text(Design(), ports, rate_hz, operators=operators)
+        yield EmulatedRig(text, RemoteWorld(here), Hands())
     finally:
         os.environ.pop("DISPLAY", None)
         if before is not None:
@@ -415,7 +418,7 @@ def _end(process: Any, pipe: Connection) -> None:
         process.join()
 
 
-def rig_text(design: Design, ports: dict[str, str], rate_hz: float) -> str:
+def rig_text(design: Design, ports: dict[str, str], rate_hz: float, *, operators: bool = True) -> str:
     """Return the rig file of the emulated rig."""
     (row, column), panel = design.region_origin_yx, design.panel
     lines = []
@@ -444,13 +447,9 @@ def rig_text(design: Design, ports: dict[str, str], rate_hz: float) -> str:
         f"refresh_hz = {panel.frame_rate_hz}",
         f"settling_s = {design.settling_s + _SETTLING_MARGIN_S}",
         "",
-        "[operator.pedal]",
-        'driver = "pedal"',
-        "",
-        "[operator.puck]",
-        'driver = "spacemouse"',
-        "",
     ]
+    if operators:
+        lines += ["[operator.pedal]", 'driver = "pedal"', "", "[operator.puck]", 'driver = "spacemouse"', ""]
     for stage, axes in (("coarse", design.coarse), ("fine", design.fine)):
         lines += [f"[stage.{stage}]", 'driver = "gcs"', f'tcp = "{ports[stage]}"']
         for name, axis in axes.items():
