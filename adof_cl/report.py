@@ -85,20 +85,17 @@ def _mask_and_depth(record: RunRecord) -> Figure:
     truth = np.array([i.true_depth_um for i in record.iterations])
     depth.plot(time, truth, "k-", lw=0.8, label="true depth")
     depth.plot(time, estimated, ".", ms=3, label="estimated")
-    beyond = np.array([i.depth_margin_um for i in record.iterations])
-    depth.fill_between(
-        time, estimated, estimated + np.maximum(beyond, 0), step="post", alpha=0.25, lw=0, color="C0",
-        label="what the mask still covers",
-    )  # fmt: skip
     depth.set(ylabel="depth (µm)", xlabel="time since the first frame (s)")
     error = depth.twinx()
     error.errorbar(time, estimated - truth, yerr=sigma, fmt=".", ms=2, lw=0.6, color="C1", label="error ± σ")
+    beyond = [i.depth_margin_um for i in record.iterations]
+    error.step(time, beyond, where="post", lw=0.6, color="C2", label="covered beyond the parts")
     limit = (
         max(10.0, float(np.nanpercentile(np.abs(estimated - truth), 98)) * 1.5)
         if np.isfinite(truth).any()
         else 10
     )
-    error.set(ylabel="estimate − truth (µm)", ylim=(-limit, limit))
+    error.set(ylabel="estimate − truth, covered beyond (µm)", ylim=(-limit, limit))
     depth.legend(loc="upper right")
     error.legend(loc="lower left")
     return figure
