@@ -35,6 +35,7 @@ from test_cli_run import COMPLETE
 from test_loop import BIAS_PX, COARSE_RAD, COARSE_UM, DEPTH_UM, FINE_UM
 from test_record import strict
 from test_slm_window import needs_gl, server
+from umockdev_there import umockdev_is_there
 
 SEED = 3
 ADOF = (sys.executable, "-c", "from adof_cl.cli import main; main()")
@@ -42,6 +43,10 @@ needs_wire = pytest.mark.skipif(
     shutil.which("Xvfb") is None
     or any(find_spec(name) is None for name in ("viva_genicam", "glfw", "OpenGL")),
     reason="Xvfb, viva-genicam, glfw or PyOpenGL is not installed",
+)
+
+needs_umockdev = pytest.mark.skipif(
+    not umockdev_is_there(), reason="umockdev with its Python bindings is not installed"
 )
 
 
@@ -334,6 +339,26 @@ def test_another_program_finds_the_whole_emulated_rig_by_its_file(tmp_path: Path
     assert {f"axis {name}" for name in ("x", "y", "z", "theta")} <= wrong
     assert all(what.startswith(("axis", "frame", "losses")) for what in wrong)
     assert done.returncode == 1  # the program's own
+
+
+@needs_wire
+@needs_umockdev
+@pytest.mark.usefixtures("loopback_cameras")
+@pytest.mark.timeout(300)
+def test_the_whole_rig_is_opened_through_the_systems_own_hidapi_too(tmp_path: Path) -> None:
+    file = tmp_path / "emulated.toml"
+    still = tmp_path / "hands.txt"
+    still.write_text("wait 100\n")
+    hands = (*ADOF, "emulate", "hid", "spacemouse,pedal", "--script", str(still), "--")
+    done = subprocess.run(
+        (*ADOF, "emulate", "rig", str(file), "--operators", "--rate-hz", "20", "--", *hands,
+         *ADOF, "rig", "check", str(file), "--json"),
+        capture_output=True, text=True, check=False, timeout=200,
+    )  # fmt: skip
+    findings = json.loads(done.stdout)
+    assert {"camera.1", "slm.LC2002", "stage.fine", "operator.pedal", "operator.puck"} <= {
+        f["device"] for f in findings if f["good"]
+    }
 
 
 def test_a_rig_file_that_cannot_be_written_is_refused_before_anything_is_started(

@@ -21,13 +21,18 @@ def rig(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Draws the start and all noise.")] = 0,
     rate_hz: Annotated[float, typer.Option("--rate-hz", help="Frames a second of its cameras.")] = 60.0,
+    operators: Annotated[
+        bool,
+        typer.Option("--operators", help="Name a pedal and a SpaceMouse too: adof emulate hid has them."),
+    ] = False,
 ) -> None:
     """Start two cameras, two stages and a panel whose world is the twin's; write a rig file that names them.
 
     With a program: runs it with DISPLAY set to the panel's, then ends; its exit code is passed on. Without:
-    stays until Ctrl-C. Operator devices need device nodes: adof emulate hid.
+    stays until Ctrl-C. Operator devices need device nodes, which adof emulate hid makes for one program.
 
-    Examples: adof emulate rig emulated.toml -- adof rig check emulated.toml | adof emulate rig emulated.toml
+    Examples: adof emulate rig rig.toml -- adof rig check rig.toml | adof emulate rig rig.toml --operators --
+    adof emulate hid spacemouse,pedal --script hands.txt -- adof run --rig rig.toml --home
     """
     from adof_cl.cli.emulated_rig import emulated
     from adof_cl.errors import InputError
@@ -38,7 +43,7 @@ def rig(
     if not file.parent.is_dir():
         raise InputError(f"{file} cannot be written (no such folder): choose another place")
     code = 0
-    with emulated(seed, rate_hz=rate_hz, operators=False) as there:
+    with emulated(seed, rate_hz=rate_hz, operators=operators) as there:
         with whole_file(file) as path:
             path.write_text(there.text, encoding="utf-8")
         if program:

@@ -503,10 +503,12 @@ def _print_summary(record: RunRecord, arms: Sequence[ArmResult], folder: Path) -
                 f"θ {1e3 * errors['theta']:+.2f} mrad off"
             )
     for p in record.positions:
+        known = math.isfinite(p.lateral_bias_um[0])  # to the twin alone
+        depth = f"depth {p.depth_um:6.1f} µm, estimated" if known else "depth"
+        bias = f", bias {p.lateral_bias_um[0]:+.2f} {p.lateral_bias_um[1]:+.2f} µm" if known else ""
         print(
-            f"      {p.name}: depth {p.depth_um:6.1f} µm, estimated {p.depth_est_um:6.1f}, α {p.alpha:5.2f}, "
-            f"SSD hole {p.ssd_hole:.2f} peg {p.ssd_peg:.2f}, "
-            f"bias {p.lateral_bias_um[0]:+.2f} {p.lateral_bias_um[1]:+.2f} µm"
+            f"      {p.name}: {depth} {p.depth_est_um:6.1f} ± {p.depth_sigma_um:.1f} µm, α {p.alpha:5.2f}, "
+            f"SSD hole {p.ssd_hole:.2f} peg {p.ssd_peg:.2f}{bias}"
         )
     compute = metrics["compute_ms"]
     if compute["p50"] is not None and math.isfinite(compute["p50"]):
