@@ -10,9 +10,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from rich.table import Table
 
 from adof_cl import __version__
 from adof_cl.cli import COMMANDS, main
+from adof_cl.cli.tables import print_table
 from adof_cl.device import SELECTOR_VARIABLE, list_devices
 
 
@@ -120,3 +122,12 @@ def test_without_any_opencl_platform_the_cure_is_named(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert "pip install pocl-binary-distribution" in done.stderr
+
+
+def test_brackets_in_a_table_stand_for_themselves(capsys: pytest.CaptureFixture[str]) -> None:
+    table = Table("to mend [first]")
+    table.add_row("pip install 'adof-cl[gige]'")
+    print_table(table)
+    said = capsys.readouterr().out
+    assert "adof-cl[gige]" in said
+    assert "to mend [first]" in said

@@ -8,7 +8,7 @@ from rich.table import Table
 
 
 def print_table(table: Table) -> None:
-    """Print a table as wide as its content, whatever the terminal's width."""
-    console = Console()
+    """Print a table as wide as its content, whatever the terminal's width; brackets stand for themselves."""
+    console = Console(markup=False)
     wanted = Measurement.get(console, console.options.update(max_width=10_000), table).maximum
-    Console(width=max(wanted, 1)).print(table)
+    Console(width=max(wanted, 1), markup=False).print(table)
